@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.plugins import load_plugins
 from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, F64
@@ -201,7 +201,8 @@ def normalise_quats(quats: NDArray[Any]) -> F32:
     return wide.astype(np.float32)
 
 
-def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
+def _check_array(name: str, array: object, shape: tuple[int | str, ...]) -> None:
+    """Raise an `InputError` unless an array is float32, finite and of a shape, where a string stands for any size."""
     expected = "[" + ", ".join(str(size) for size in shape) + "]"
     if not isinstance(array, np.ndarray):
         raise InputError(f"{name} is a {type(array).__name__}, expected a float32 array {expected}")
@@ -214,7 +215,7 @@ def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
         raise InputError(f"{name} is {array.dtype}, expected float32")
     bad = _non_finite_count(array)
     if bad:
-        raise InputError(f"{name} contains {bad} values that are NaN or infinite")
+        raise InputError(f"{name} contains NaN or infinity ({counted(bad, 'value')})")
 
 
 def _non_finite_count(array: F32) -> int:

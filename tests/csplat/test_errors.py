@@ -74,7 +74,7 @@ def test_values_that_are_not_finite_are_refused(make_model, field):
     for value in (np.nan, np.inf, -np.inf):
         array = getattr(make_model(), field).copy()
         array.flat[-1] = value
-        with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
+        with pytest.raises(InputError, match=rf"{field} contains NaN or infinity \(1 value\)"):
             make_model(**{field: array})
 
 

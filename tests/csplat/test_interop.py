@@ -147,7 +147,7 @@ def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
         ({"model": 3}, "it holds model: neither"),
         ({"splats": {**splats, "means": many}}, "means is not a tensor, or larger than the file"),
         ({"splats": {**splats, "means": "many"}}, "means is not a tensor"),
-        ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
+        ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinity"),
         ({"splats": {"means": splats["means"]}}, "no quats"),
         ({f"m.{name}": splats.get(name, splats["sh0"]) for name in names}, "no sh0, .*; it was trained with appear"),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
@@ -303,7 +303,7 @@ def test_invalid_tensors_and_damage_are_refused(torch, make_model, tmp_path):
     splats, path = to_gsplat(make_model(3, 0), device="cpu"), tmp_path / "a.pt"
     for values, message in (
         ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is not a tensor, or larger than the file"),
-        ({**splats, "means": torch.full((3, 3), torch.inf)}, "NaN or infinite"),
+        ({**splats, "means": torch.full((3, 3), torch.inf)}, "NaN or infinity"),
         ({**splats, "sh0": torch.zeros(3, 2)}, "sh0 has shape"),
         (print, "contains objects that could run code"),
     ):

@@ -177,8 +177,8 @@ class Display:
                 minutes, seconds = divmod(int(now - self._begun), 60)
                 note(f"{text}; {minutes}:{seconds:02d} so far")
 
-    def close(self) -> None:
-        """Remove the bars. The next tick shows them again."""
+    def hide_bars(self) -> None:
+        """Remove the bars from the terminal, before other output or at the end; the next tick shows them again."""
         with self._lock:
             if self._bars is not None:
                 self._bars.stop()
@@ -249,7 +249,7 @@ def displayed(display: Display) -> Iterator[Display]:
         yield display
     finally:
         _displays.remove(display)
-        display.close()
+        display.hide_bars()
 
 
 @contextmanager
@@ -308,7 +308,7 @@ _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) i
 
 def _echo(text: str, stream: TextIO) -> None:
     for display in _displays:
-        display.close()  # bars and lines on one terminal do not mix
+        display.hide_bars()  # bars and lines on one terminal do not mix
     text = text.translate(_CONTROLS)
     encoding = stream.encoding or "utf-8"  # may lack characters of file names and metadata
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")

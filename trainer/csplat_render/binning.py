@@ -67,6 +67,10 @@ def depth_order(depth: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> i
 
 @device_function
 def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> None:
+    """Move `n` keys and their order to keys2 and order2, in the order of the digit from bit `shift` on; stable.
+
+    `counts` has the first place of each digit, and is advanced.
+    """
     for j in range(n):
         key = keys[j]
         b = (key >> shift) & mask

@@ -119,6 +119,7 @@ def check_last_row(pose: F64, name: str) -> None:
 
 
 def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
+    """Return a read-only matrix, [size, size] float64; raise an `InputError` unless it is finite."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
@@ -132,6 +133,7 @@ def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
 
 
 def _checked_size(name: str, value: Any) -> int:
+    """Return a number of pixels; raise an `InputError` unless it is whole, and 1 to `MAX_IMAGE_SIZE`."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"the camera's {name} is {value!r}, expected a number of pixels")
     if not (math.isfinite(value) and value == int(value) and 1 <= value <= MAX_IMAGE_SIZE):
@@ -140,6 +142,7 @@ def _checked_size(name: str, value: Any) -> int:
 
 
 def _checked_near(value: Any) -> float:
+    """Return the distance of the near plane; raise an `InputError` unless it is finite and above 0."""
     try:
         near = float(value)
     except (TypeError, ValueError):
@@ -150,6 +153,7 @@ def _checked_near(value: Any) -> float:
 
 
 def _check_intrinsics(K: F64) -> None:
+    """Raise an `InputError` unless K, [3, 3], has focal lengths above 0 and no skew."""
     if not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
         raise InputError(f"the camera's focal lengths are {K[0, 0]:g} and {K[1, 1]:g} pixels, expected above 0")
     if K[0, 1] != 0.0 or K[1, 0] != 0.0 or (K[2] != (0.0, 0.0, 1.0)).any():
@@ -157,6 +161,7 @@ def _check_intrinsics(K: F64) -> None:
 
 
 def _check_pose(viewmat: F64) -> None:
+    """Raise an `InputError` unless a viewmat, [4, 4], is a rotation and a translation."""
     R = viewmat[:3, :3]
     check_last_row(viewmat, "the camera's viewmat")
     with np.errstate(over="ignore", invalid="ignore"):

@@ -319,6 +319,7 @@ def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
 
 
 def _own_cameras(entries: object, path: Path) -> list[Camera]:
+    """Read a list of cameras in csplat's own form; raise an `InputError` that names other contents of the file."""
     first = entries[0] if isinstance(entries, list) and entries else entries
     unread = [text for fields, text in _UNREAD if isinstance(first, Mapping) and fields <= first.keys()]
     if unread:
@@ -361,6 +362,16 @@ def _make_camera(
     near: float,
     image: Any,
 ) -> Camera:
+    """Build a camera; error messages begin with `at`.
+
+    Args:
+        at: file and entry.
+        focals, middle: fx, fy and cx, cy, pixels.
+        viewmat: [4, 4].
+        size: width and height, pixels.
+        near: near plane, scene units.
+        image: name of the image, or `None`.
+    """
     (fx, fy), (cx, cy), (width, height) = focals, middle, size
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     try:
@@ -370,6 +381,7 @@ def _make_camera(
 
 
 def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
+    """Read an entry of cameras.json; the principal point is the middle of the image."""
     width, height = finite_number(entry, "width", at), finite_number(entry, "height", at)
     focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
     try:
@@ -386,6 +398,7 @@ def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
 
 
 def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
+    """Read an entry of a camera path, whose size and type are in the document; `fov` is vertical, degrees."""
     kind = str(document.get("camera_type") or "perspective")
     if kind.lower() != "perspective":
         raise InputError(f"{at}: camera_type is {kind}, expected perspective")
@@ -402,6 +415,7 @@ def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at:
 
 
 def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
+    """Read a frame of transforms.json; what it lacks is in the document."""
     values = frame_values(document, frame)
     if values.get("w") is None or values.get("h") is None:
         raise InputError(f"{at}: w and h are missing, expected the size of the images (--data reads it from them)")

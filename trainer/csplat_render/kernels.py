@@ -224,6 +224,8 @@ def fast_exp2(x: float) -> float:
 
 
 def _fast_exp2(x: Any) -> Callable[[Any], Any]:
+    """Return the implementation of `fast_exp2` for a type of numba."""
+
     def exact(x: Any) -> Any:
         return math.exp(x * _LN2)
 
@@ -312,6 +314,7 @@ class _HelperThread:
             raise error
 
     def _serve(self) -> None:
+        """Make the calls, one after the other, for ever."""
         while True:
             self._begun.acquire()
             function, arguments = self._job

@@ -139,6 +139,7 @@ def save_lpips(path: str | Path, weights: Lpips) -> None:
 
 
 def _read(path: Path) -> Lpips:
+    """Read the weights from an .npz file; raise an `InputError` if it does not contain them."""
     count = range(len(_LAYERS))
     try:
         file = read_archive(path, "a file of LPIPS weights (.npz)")

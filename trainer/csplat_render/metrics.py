@@ -208,6 +208,11 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _clip(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
+    """Return two images, [H, W, 3] float64, clipped to 0..1.
+
+    Raises:
+        InputError: an image has another shape or dtype or contains NaN, or the shapes differ.
+    """
     for name, array in (("reference", reference), ("image", image)):
         if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
             raise InputError(f"the {name} has shape {list(array.shape)}, expected [H, W, 3]")

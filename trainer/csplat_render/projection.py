@@ -322,6 +322,7 @@ _MAX_GRADIENT = 1e37  # gradients are clamped to ± this so that sums of them fi
 
 @device_function
 def _clamp(value: float) -> float:
+    """Clamp a gradient to ± `_MAX_GRADIENT`; NaN becomes 0."""
     if not (abs(value) <= _MAX_GRADIENT):
         if value > 0.0:
             return _MAX_GRADIENT

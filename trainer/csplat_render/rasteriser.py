@@ -237,6 +237,7 @@ class Rasteriser:
         return view, radii, int(ignored.sum())
 
     def _depth_order(self, near: Array) -> Array:
+        """Return the indices of the drawn splats, nearest first, by their depths `near` [N], 0 for others."""
         n = len(near)
         order = self._buffer("order", (n,), np.int32)
         count = depth_order(
@@ -251,6 +252,22 @@ class Rasteriser:
     def _sort_into_tiles(
         self, order: Array, near: Array, extent: Array, box: Array, tiles_x: int, tile_count: int
     ) -> tuple[Array, int]:
+        """Fill the buffers of splats by tile; with gradients, also the places of their records.
+
+        Args:
+            order: indices of the drawn splats, nearest first.
+            near: [N], depths.
+            extent: [N, 6], see `project`.
+            box: [N, 4], bounds on the screen, pixels.
+            tiles_x: tiles per row of the image.
+            tile_count: tiles of the image.
+
+        Returns:
+            [tile_count + 1], the first pair of each tile, and the end; number of pairs of splat and tile.
+
+        Raises:
+            LimitError: there are more than `MAX_INTERSECTIONS` pairs.
+        """
         n = len(near)
         chunks = CHUNKS if tile_count < _MANY_TILES else _CHUNKS_OF_MANY_TILES
         counts = self._buffer("counts", (chunks, tile_count), np.int32)
@@ -288,6 +305,7 @@ class Rasteriser:
 
 
 def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Array:
+    """Return the state, empty for `None`; raise an `InputError` for another shape or dtype."""
     if state is None:
         return np.empty((0, 0, 5), dtype)
     if state.shape != tuple(shape) or state.dtype != dtype:
@@ -296,6 +314,7 @@ def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Arr
 
 
 def _checked_gradient(name: str, gradient: ArrayLike | None, shape: Sequence[int], dtype: Any) -> Array:
+    """Return a gradient, 0 for `None`, in a dtype; raise an `InputError` for another shape."""
     if gradient is None:
         return np.zeros(tuple(shape), dtype)
     array = np.ascontiguousarray(gradient, dtype)

@@ -122,8 +122,8 @@ def _project(
     ).transpose(2, 0, 1)
     M = rotation * np.exp(np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))[:, None, :]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
-    tx = _clamp(x / z, fx, cx, camera.W, decisions)
-    ty = _clamp(y / z, fy, cy, camera.H, decisions)
+    tx = _clamp_tangent(x / z, fx, cx, camera.W, decisions)
+    ty = _clamp_tangent(y / z, fy, cy, camera.H, decisions)
     zero = np.zeros_like(z)
     jacobian = np.array([[fx / z, zero, -fx * tx / z], [zero, fy / z, -fy * ty / z]]).transpose(2, 0, 1)
     half_axes = jacobian @ R @ M
@@ -159,8 +159,11 @@ def _unit(quats: Array) -> Array:
     return np.where(length > 0.0, quats / length, [1.0, 0.0, 0.0, 0.0])
 
 
-def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
-    """Clamp x/z or y/z, [n], to the image with a margin, in which the perspective is linearised."""
+def _clamp_tangent(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
+    """Clamp tangents x/z or y/z, [n], to the image plus `FOV_MARGIN`; the perspective is linearised there.
+
+    Focal length, centre and size of the image are those of the axis, in pixels. `decisions` records both comparisons.
+    """
     margin = FOV_MARGIN * 0.5 * size / focal
     low, high = -centre / focal - margin, (size - centre) / focal + margin
     return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)

@@ -190,6 +190,7 @@ class Scorer:
         return metrics.Scores.of(scores, ignored)
 
     def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], Render]:
+        """Return a function that renders a scene for cameras relative to `origin`, or to its own for `None`."""
         render = renderer(model, self.background, mode=self.mode, context=self.context)
         if self.origin is None:
             return render

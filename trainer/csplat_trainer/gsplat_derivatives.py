@@ -182,9 +182,9 @@ class _Derivatives:
         """Return the SH basis in the direction of each splat, [N, B]."""
         offsets = self._splats.means.detach() - self._rasteriser.upload(camera.position.astype(np.float32))
         x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
-        values: list[Any] = [None] * (self._degree + 1) ** 2
-        sh_basis(self._degree, x, y, z, values)
-        return torch.stack([value * torch.ones_like(x) for value in values], dim=1)
+        basis = offsets.new_empty(((self._degree + 1) ** 2, len(offsets)))
+        sh_basis(self._degree, x, y, z, basis)
+        return basis.T.contiguous()
 
 
 def _covariances(quats: Tensor, scales: Tensor) -> Tensor:

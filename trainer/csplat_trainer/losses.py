@@ -119,7 +119,7 @@ class PhotometricLoss:
         l1_step = np.float32(self.l1_weight / count)
         if self.ssim_weight != 0.0:
             blur_products(x, y, _TAPS, self._across)
-            _ssim_partials(x, y, self._across, self._partial, self._sums)
+            _ssim_partials_and_sums(x, y, self._across, self._partial, self._sums)
             _blur_partials(self._partial, self._partial_across)
             _combine(x, y, self._partial_across, l1_step, np.float32(-self.ssim_weight / count), gradient)
         else:
@@ -152,30 +152,40 @@ class SizedLosses:
 
 
 @parallel_kernel(relaxed=True)
-def _ssim_partials(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
-    """Compute SSIM of each value of [H, 3 W] and its derivatives by mean, square and product; vectorises over a row."""
+def _ssim_partials_and_sums(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
+    """Compute the derivatives of SSIM by its moments, and the sums of each row; vectorises over the values of a row.
+
+    Args:
+        x, y: [H, 3 W].
+        across: [5, H + 2 RADIUS, 3 W]; x, y, x², y², xy blurred along rows, from `blur_products`.
+        partial: [3, H, 3 W + 2 _PAD], written but for the margins; derivatives by the blurred x, x² (doubled) and xy.
+        sums: [H, 3], written; |x − y|, SSIM and (x − y)².
+    """
     height, width = x.shape
+    # float32 constants: a Python float would widen the loop to float64
     c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
     moments = np.empty((5, width), np.float32)
     for r in range(lane, height, lanes):
         for f in range(5):
             blur_down(across[f], r, _TAPS, moments[f])
-        m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
-        p0, p1, p2 = partial[0, r], partial[1, r], partial[2, r]
+        mean_x, mean_y = moments[0], moments[1]
+        square_x, square_y, product = moments[2], moments[3], moments[4]
+        by_mean_row, by_square_row, by_product_row = partial[0, r], partial[1, r], partial[2, r]
         ssim_sum, l1_sum, square_sum = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         for i in range(width):
-            mx, my = m1[i], m2[i]
+            mx, my = mean_x[i], mean_y[i]
             a = two * mx * my + c1
-            b = two * (e12[i] - mx * my) + c2
+            b = two * (product[i] - mx * my) + c2
             c = mx * mx + my * my + c1
-            d = (e11[i] - mx * mx) + (e22[i] - my * my) + c2
+            d = (square_x[i] - mx * mx) + (square_y[i] - my * my) + c2
             over_cd = one / (c * d)
             ssim = a * b * over_cd
             by_square = -ssim / d
             by_product = two * a * over_cd
-            p0[i + _PAD] = two * my * b * over_cd - two * mx * ssim / c - two * mx * by_square - my * by_product
-            p1[i + _PAD] = two * by_square
-            p2[i + _PAD] = by_product
+            by_mean = two * my * b * over_cd - two * mx * ssim / c - two * mx * by_square - my * by_product
+            by_mean_row[i + _PAD] = by_mean
+            by_square_row[i + _PAD] = two * by_square
+            by_product_row[i + _PAD] = by_product
             difference = x[r, i] - y[r, i]
             ssim_sum += ssim
             l1_sum += abs(difference)
@@ -203,10 +213,10 @@ def _combine(
     for r in range(lane, height, lanes):
         for f in range(3):
             blur_down(across[f], r, _TAPS, blurred[f])
-        p0, p1, p2 = blurred[0], blurred[1], blurred[2]
+        by_mean, by_square, by_product = blurred[0], blurred[1], blurred[2]
         for i in range(width):
             difference = x[r, i] - y[r, i]
-            ssim = p0[i] + x[r, i] * p1[i] + y[r, i] * p2[i]
+            ssim = by_mean[i] + x[r, i] * by_square[i] + y[r, i] * by_product[i]
             gradient[r, i] = l1_step * np.sign(difference) + ssim_step * ssim
 
 

@@ -246,12 +246,15 @@ def densify(
 
 
 def reset_opacities(parameters: Parameters) -> None:
-    """Make every splat nearly transparent; training restores those that the images need."""
+    """Lower all opacities to at most `_RESET_ALPHA`; training restores those that the images need.
+
+    The optimiser's moments of the opacities are cleared, so that they do not undo it.
+    """
     rows = np.arange(len(parameters))
     logit = np.float32(np.log(_RESET_ALPHA / (1.0 - _RESET_ALPHA)))
     parameters.write("logits", rows, np.minimum(parameters.read("logits", rows), logit))
-    for memory in (parameters.first, parameters.second):
-        memory["logits"][:] = 0.0
+    for moments in (parameters.first, parameters.second):
+        moments["logits"][:] = 0.0
 
 
 def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:

@@ -92,6 +92,17 @@ def wanted_codebooks(header: SceneHeader, tiles: Iterable[Tile], degree: int) ->
 def _read_chunk(
     view: memoryview, header: SceneHeader, record: _spec.DirectoryRecord, book: _spec.CodebookRecord
 ) -> Ints:
+    """Read and check a codebook chunk (CDB-1, CDB-2, and the clauses of streams and entries).
+
+    Args:
+        view: the file.
+        header: its header.
+        record: directory record of the chunk.
+        book: record of its codebook.
+
+    Returns:
+        [size, columns], integers of the entries.
+    """
     cursor = open_chunk(view, record, record.type, record.flags, "CDB-2")
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)

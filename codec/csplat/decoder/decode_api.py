@@ -357,6 +357,7 @@ def _check_tile_budget(request: DecodeRequest) -> None:
 
 
 def _allocate(count: int, make: Callable[[], _T], request: DecodeRequest) -> _T:
+    """Return the result of `make`; raise a `LimitError` if the machine lacks memory for `count` splats."""
     try:
         return make()
     except MemoryError:

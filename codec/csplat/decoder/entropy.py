@@ -61,6 +61,7 @@ def read_stream(
 
 
 def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: int) -> None:
+    """Check the stream head at `at` (RES-1, RES-2, STR-1 to STR-5); a `count` of `None` stands for any from 1."""
     check_reserved(head, at, _OFFSETS)
     wanted = max(1, head.count) if count is None else count
     if head.count != wanted:
@@ -101,6 +102,7 @@ def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | m
 
 
 def _inflate(coded: memoryview, size: int, at: int) -> bytes:
+    """Return exactly `size` bytes from DEFLATE (COD-2 to COD-8); `at` is the offset of the coded bytes in the file."""
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
         # COD-4: asking for another byte detects a stream that is too long, and lets inflate reach the stream's end.

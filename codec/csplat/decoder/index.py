@@ -33,6 +33,8 @@ STEP_MIN = 2.0**-1022
 SINGLE_MIN, SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104
 _SINGLE_END = 2.0**128 - 2.0**103  # the smallest number that binary32 rounds to infinity (MEA-1)
 
+_CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
+_STEP_SIZE = 8  # bytes of a step, binary64
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))  # control characters, forbidden in names (EXR-2)
 #: Record sizes in the index head and their minima, the sizes that this version reads.
 _RECORD_SIZES: Final = {
@@ -116,6 +118,7 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
 
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:
+    """Check the index head at offset `at`: RES-1, IDX-3 to IDX-6, IDX-8."""
     offsets = _spec.INDEX_HEAD_OFFSETS
     check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
@@ -159,6 +162,7 @@ def _check_room(head: _spec.IndexHead, index_size: int) -> None:
 
 
 def _read_attributes(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[_spec.AttributeRecord, ...]:
+    """Read the attribute records, which begin at `at`, and check ATT-1 to ATT-10; IDX-2 has been checked."""
     wanted = range(_spec.ATTRIBUTE_OPACITIES, _spec.ATTRIBUTE_SH0 + 1 + head.sh_degree)
     if head.attribute_count != len(wanted):
         offsets = _spec.INDEX_HEAD_OFFSETS
@@ -171,12 +175,14 @@ def _read_attributes(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[
             raise FormatError(
                 _spec.ERROR_INDEX, record_at, "ATT-1", "attribute", found=record.attribute, wanted=attribute
             )
-        _check_attribute(record, record_at, bytes(view[record_at + 8 : record_at + 16]))
+        step_at = record_at + _spec.ATTRIBUTE_RECORD_OFFSETS["step"]
+        _check_attribute(record, record_at, bytes(view[step_at : step_at + _STEP_SIZE]))
         records.append(record)
     return tuple(records)
 
 
 def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -> None:
+    """Check RES-1 and ATT-2 to ATT-10 for the record at offset `at`; `step_bits` also tells -0 from +0 (ATT-7)."""
     offsets = _spec.ATTRIBUTE_RECORD_OFFSETS
     check_reserved(record, at, offsets)
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
@@ -210,6 +216,7 @@ def _is_single(step: float) -> bool:
 
 
 def _check_chroma(record: _spec.AttributeRecord, at: int) -> None:
+    """Check ATT-8 and ATT-9."""
     offsets, most = _spec.ATTRIBUTE_RECORD_OFFSETS, _spec.CHROMA_SHIFT_MAX
     if record.chroma_shift > most:
         refuse_field(_spec.ERROR_VALUE, "ATT-8", record, at, offsets, "chroma_shift", f"at most {most}")
@@ -235,6 +242,7 @@ def read_codebook_records(view: memoryview, at: int, head: _spec.IndexHead) -> t
 
 
 def _check_codebook(record: _spec.CodebookRecord, at: int, sh_degree: int) -> None:
+    """Check CBR-2 and CBR-4 for the record at offset `at`."""
     offsets = _spec.CODEBOOK_RECORD_OFFSETS
     bands = (record.band_first, record.band_last)
     if record.kind == _spec.CODEBOOK_KIND_SH:
@@ -270,6 +278,7 @@ def read_extras(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[Extra
 
 
 def _column_name(record: _spec.ExtraRecord, at: int) -> str:
+    """Return the name of an extra column, which begins at offset `at`; check EXR-2 and EXR-3."""
     raw, rest = record.name[: record.name_size], record.name[record.name_size :]
     try:
         name = raw.decode("utf-8")
@@ -308,6 +317,7 @@ def _check_chunk_size(record: _spec.DirectoryRecord | _spec.LayerRecord, at: int
 
 
 def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
+    """Check type and flags of the directory record at offset `at`: DIR-1, DIR-2, DIR-6, RES-1, CHK-4."""
     if record.type == _spec.CHUNK_TILE or not all(0x20 <= byte <= 0x7E for byte in record.type):
         raise FormatError(_spec.ERROR_VALUE, at, "DIR-1", "type", found=record.type)
     flags_at = at + _spec.DIRECTORY_RECORD_OFFSETS["flags"]
@@ -371,7 +381,7 @@ def read_tiles(
     for index in range(head.tile_count):
         tile, size = _read_tile(view, at, end, index, start, head)
         _check_tile(tile, means_step)
-        _check_codebook_ids(tile, known, at + size - 2 * len(tile.codebook_ids))
+        _check_codebook_ids(tile, known, at + size - _CODEBOOK_ID_SIZE * len(tile.codebook_ids))
         tiles.append(tile)
         start += tile.splat_count
         at += size
@@ -433,17 +443,32 @@ def check_coverage(
 
 
 def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head: _spec.IndexHead) -> tuple[Tile, int]:
-    """Return a tile with checked layers, and the size of its records in bytes."""
+    """Read a tile record with its layer records and table ids; check the layers.
+
+    Args:
+        view: the file, at least up to `end`.
+        at: offset of the tile record.
+        end: offset of the index's CRC.
+        index: index of the tile.
+        start: index of its first splat.
+        head: the index head.
+
+    Returns:
+        The tile, and the size of its records in bytes.
+
+    Raises:
+        FormatError: the records do not fit into the index, or layers break a clause.
+        UnsupportedError: a layer of unknown id that is not ancillary.
+    """
     if end - at < head.tile_size:
         _ends_early(at)
     record = _spec.unpack_tile_record(view, at)
     layers_at = at + head.tile_size
     tables_at = layers_at + record.layer_count * head.layer_size
-    after = tables_at + 2 * record.table_count
+    after = tables_at + _CODEBOOK_ID_SIZE * record.table_count
     if after > end:
         _ends_early(at)
     check_reserved(record, at, _spec.TILE_RECORD_OFFSETS)
-    raw = bytes(view[tables_at:after])
     tile = Tile(
         index=index,
         offset=at,
@@ -455,7 +480,7 @@ def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head
         extent=record.extent,
         max_scale=record.max_scale,
         layers=_read_layers(view, layers_at, record, head),
-        codebook_ids=tuple(int.from_bytes(raw[i : i + 2], "little") for i in range(0, len(raw), 2)),
+        codebook_ids=struct.unpack_from(f"<{record.table_count}H", view, tables_at),
     )
     return tile, after - at
 
@@ -467,6 +492,7 @@ def _ends_early(at: int) -> NoReturn:
 def _read_layers(
     view: memoryview, at: int, tile: _spec.TileRecord, head: _spec.IndexHead
 ) -> dict[int, _spec.LayerRecord]:
+    """Return the layer records of a tile by layer, the first at `at`; check RES-2, TIL-2, TIL-3, TIL-5, CHK-3."""
     layers: dict[int, _spec.LayerRecord] = {}
     offsets, last = _spec.LAYER_RECORD_OFFSETS, -1
     for i in range(tile.layer_count):
@@ -491,6 +517,7 @@ def _read_layers(
 
 
 def _check_tile(tile: Tile, means_step: float) -> None:
+    """Check number of splats, box and exponent of a tile: TIL-1, TIL-7 to TIL-9, MEA-1."""
     offsets = _spec.TILE_RECORD_OFFSETS
     if not 1 <= tile.splat_count <= _spec.TILE_SPLATS_MAX:
         wanted = f"1 to {_spec.TILE_SPLATS_MAX}"
@@ -515,9 +542,11 @@ def _check_tile(tile: Tile, means_step: float) -> None:
 
 
 def _check_codebook_ids(tile: Tile, known: set[int], at: int) -> None:
+    """Check TIL-6: the ids of the codebooks, the first at offset `at`, ascend and are among the `known` ids."""
     last = -1
     for i, identity in enumerate(tile.codebook_ids):
         if identity <= last or identity not in known:
             wanted = "ids of codebooks, ascending"
-            raise FormatError(_spec.ERROR_INDEX, at + 2 * i, "TIL-6", "codebook id", found=identity, wanted=wanted)
+            id_at = at + i * _CODEBOOK_ID_SIZE
+            raise FormatError(_spec.ERROR_INDEX, id_at, "TIL-6", "codebook id", found=identity, wanted=wanted)
         last = identity

@@ -196,6 +196,7 @@ class _RefusedError(ValueError):
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of pairs from the `json` module; raise a `_RefusedError` if a name occurs twice."""
     result = dict(pairs)
     if len(result) != len(pairs):
         raise _RefusedError("a name occurs twice in an object")
@@ -207,6 +208,7 @@ def _constant(name: str) -> None:
 
 
 def _number(digits: str) -> float:
+    """Return the number of a decimal; raise a `_RefusedError` if it exceeds binary64."""
     value = float(digits)
     if not math.isfinite(value):
         raise _RefusedError("a number is not finite in binary64")

@@ -333,6 +333,7 @@ def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None
 
 
 def _check_finite(parts: tuple[Ints, Ints, Ints], step: float, record: _spec.AttributeRecord, at: int) -> None:
+    """Check LAT-5 for the R, G and B integers of a block at offset `at`."""
     largest = max(max(-int(part.min()), int(part.max())) for part in parts)  # has the largest value
     if not np.isfinite(np.float32(float(largest) * step)):
         detail = f"{_spec.ATTRIBUTE_NAMES[record.attribute]}: {largest} x {step} is not finite in binary32"

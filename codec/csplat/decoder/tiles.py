@@ -35,6 +35,7 @@ _ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 
 _WIDE = np.dtype(np.int64)
 
+_OFFSET_SIZE = 4  # bytes of a column's offset, i32
 #: For each coding except CODEBOOK and RAW: size of the parameters, True if offsets follow, number of streams.
 _SHAPES = {
     _spec.CODING_LEVELS: (0, False, 1),
@@ -126,6 +127,7 @@ def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.Laye
 
 
 def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> None:
+    """Check the tile head at offset `at`: RES-1, TLE-1, TLE-2."""
     head = _spec.unpack_tile_head(view, at)
     offsets = _spec.TILE_HEAD_OFFSETS
     check_reserved(head, at, offsets)
@@ -272,6 +274,16 @@ def _indices(
 def _read_indices(
     cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, at: int
 ) -> Indices:
+    """Read the entry index of each splat, and check CBK-2 and CBK-3.
+
+    Args:
+        cursor: at the stream of indices.
+        context: the tile.
+        attribute: registry value.
+        book: the codebook.
+        escape_count: number of escapes by the parameters of the block.
+        at: offset of these parameters.
+    """
     count = context.tile.splat_count
     size, stream_at = book.record.size, cursor.at
     entry_indices = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
@@ -309,6 +321,7 @@ def _check_sums(block: CodebookBlock, context: TileContext) -> None:
 
 
 def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tuple[int, int]:
+    """Step over the rest of a CODEBOOK block after its head; return the offset of its codebook id, and the id."""
     at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
     params = _spec.unpack_codebook_params(cursor.view, at)
     book = next((record for record in header.codebooks if record.codebook_id == params.codebook_id), None)
@@ -317,7 +330,7 @@ def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tup
     if holds_indices(book, attribute):
         _step_over_stream(cursor)
     if attribute == _spec.ATTRIBUTE_SCALES:  # the summand: lattice parameters and an offset
-        cursor.take(_spec.LATTICE_PARAMS_SIZE + 4)
+        cursor.take(_spec.LATTICE_PARAMS_SIZE + _OFFSET_SIZE)
         _step_over_stream(cursor)
     if params.escape_count:
         _step_over(cursor, attribute, read_block_head(cursor, attribute, (_spec.CODING_OFFSET, _spec.CODING_SIGNED)))
@@ -325,8 +338,9 @@ def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tup
 
 
 def _step_over(cursor: Cursor, attribute: int, coding: int) -> None:
+    """Step over the rest of a block of another coding after its head."""
     size, offsets, streams = _SHAPES[coding]
-    cursor.take(size + 4 * offsets * _spec.ATTRIBUTE_COLUMNS[attribute])
+    cursor.take(size + _OFFSET_SIZE * offsets * _spec.ATTRIBUTE_COLUMNS[attribute])
     for _ in range(streams):
         _step_over_stream(cursor)
 

@@ -217,6 +217,15 @@ def _cut_where(nodes: Sequence[Node], is_replaced: Callable[[int], bool]) -> lis
 
 
 def _at_pixel_size(nodes: Sequence[Node], pixel_size: float | Sequence[float]) -> list[int]:
+    """Return the first node from each root whose error is at most a size of pixels, ascending.
+
+    Args:
+        nodes: all nodes.
+        pixel_size: scene units, >= 0; one number, or one for each node.
+
+    Raises:
+        InputError: there is another number of sizes, or one is negative or NaN.
+    """
     sizes = [pixel_size] * len(nodes) if isinstance(pixel_size, (int, float)) else list(pixel_size)
     if len(sizes) != len(nodes):
         raise InputError(f"pixel_size has {len(sizes)} numbers, expected one, or one for each of {len(nodes)} nodes")

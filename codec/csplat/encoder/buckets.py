@@ -133,6 +133,7 @@ class BucketCurve:
         return np.searchsorted(self.bounds, self._codes(means), side="right")
 
     def _codes(self, means: F32) -> I64:
+        """Return the Morton codes of means [n, 3], int64 [n]; positions outside the curve are clipped to it."""
         codes = np.empty(len(means), np.int64)
         for at in range(0, len(means), _CURVE_BLOCK):
             cells = (means[at : at + _CURVE_BLOCK].T.astype(np.float64) - self.corner[:, None]) * self.scale

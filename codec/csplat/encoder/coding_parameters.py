@@ -34,6 +34,7 @@ _HALF_DIAGONAL = 3.0**0.5 / 2.0  # largest displacement of a mean by rounding, i
 _STATISTICS_SAMPLE = 1 << 16  # splats
 _RUNS = 16  # runs of neighbours in the sample
 _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
+_COLOUR_DIFFERENCE_MAX = 10.0  # sh0; a larger difference is an outlier, and counts as this
 _CORE = 0.8  # fraction of the splats within the scene's reach
 _CODE_BITS = 16  # bits per axis of a Morton code
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
@@ -226,13 +227,13 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     largest = np.take(model.scales, _sample_rows(len(model)), axis=0).max(axis=1)
     size = float(exp(float(np.clip(np.median(largest), -80, 80)))) / reach if reach else 1.0
     if contrast is None:
-        contrast = _rms(*_contrast(model, points, reach))
+        contrast = _rms(*_contrast_sums(model, points, reach))
     return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
 
 
 def measure_contrast(parts: Iterable[SplatModel]) -> float:
     """Return the contrast of a scene from parts of it, each with all splats of its region."""
-    sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
+    sums = [_contrast_sums(part, *_reach(part.means)) for part in parts if len(part)]
     return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
 
 
@@ -339,19 +340,27 @@ def _rms(squares: float, weights: float) -> float:
     return SH_C0 * float(np.sqrt(squares / weights)) if weights else 0.2
 
 
-def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
-    """Return Σ w d² and Σ w over pairs of neighbours: d² is the mean square of the colour difference, w = αα'.
+def _contrast_sums(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
+    """Return Σ w d² and Σ w over pairs of splats `_NEIGHBOUR_DISTANCE` apart in Morton order.
 
-    The Morton order has its middle at the median of the positions `sample`, [n, 3].
+    d² is the mean over the channels of the squared difference of sh0, w the product of the opacities. Both sums are 0
+    for few splats, or without an extent. In a large scene, the pairs are a sample.
+
+    Args:
+        model: the splats.
+        sample: [n, 3], positions; their median is the middle of the grid of Morton codes.
+        reach: radius around the median, scene units, >= 0.
     """
-    squares = weights = 0.0
+    squares, weights = 0.0, 0.0
     if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
         return squares, weights
+    # The grid spans a reach to either side of the median.
     for rows in _neighbour_runs(model.means, np.median(sample, axis=0), 2.0 * reach):
         near, far = rows[:-_NEIGHBOUR_DISTANCE], rows[_NEIGHBOUR_DISTANCE:]
         weight = model.opacities[near].astype(np.float64) * model.opacities[far]
-        colour = np.clip(model.sh0[near].astype(np.float64) - model.sh0[far], -10, 10)
-        squares += float((np.square(colour).mean(axis=1) * weight).sum())
+        difference = model.sh0[near].astype(np.float64) - model.sh0[far]
+        difference = np.clip(difference, -_COLOUR_DIFFERENCE_MAX, _COLOUR_DIFFERENCE_MAX)
+        squares += float((np.square(difference).mean(axis=1) * weight).sum())
         weights += float(weight.sum())
     return squares, weights
 

@@ -15,6 +15,8 @@ from csplat import _spec
 from csplat.encoder.entropy import DeflateSettings, unsigned_stream
 from csplat.errors import InputError
 
+_CRC_SIZE = 4  # bytes
+_CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 #: Chunks that no renderer needs, which are last in a file with levels of detail.
 _LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 
@@ -225,6 +227,7 @@ def chunk_crc(kind: bytes, payload: Payload) -> int:
 
 
 def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
+    """Return the size of the index in bytes, including its CRC."""
     return (
         _spec.INDEX_HEAD_SIZE
         + len(scene.attributes) * _spec.ATTRIBUTE_RECORD_SIZE
@@ -232,10 +235,12 @@ def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
         + len(scene.extras) * _spec.EXTRA_RECORD_SIZE
         + len(scene.chunks) * _spec.DIRECTORY_RECORD_SIZE
         + sum(
-            _spec.TILE_RECORD_SIZE + len(tile.layers) * _spec.LAYER_RECORD_SIZE + 2 * len(tile.codebook_ids)
+            _spec.TILE_RECORD_SIZE
+            + len(tile.layers) * _spec.LAYER_RECORD_SIZE
+            + len(tile.codebook_ids) * _CODEBOOK_ID_SIZE
             for tile in tiles
         )
-        + 4
+        + _CRC_SIZE
     )
 
 
@@ -245,6 +250,14 @@ def _index(
     directory: Sequence[_spec.DirectoryRecord],
     layers: Mapping[tuple[int, int], _spec.LayerRecord],
 ) -> bytes:
+    """Return the index, including its CRC (spec 4.3).
+
+    Args:
+        scene: fields and records of the scene.
+        tiles: the tiles, whose levels ascend.
+        directory: records of the chunks other than tiles.
+        layers: layer records by (tile, layer).
+    """
     head = _spec.IndexHead(
         head_size=_spec.INDEX_HEAD_SIZE,
         attribute_size=_spec.ATTRIBUTE_RECORD_SIZE,
@@ -290,12 +303,13 @@ def _index(
             )
         )
         parts += [_spec.pack_layer_record(layers[number, layer]) for layer in sorted(tile.layers)]
-        parts += [identity.to_bytes(2, "little") for identity in tile.codebook_ids]
+        parts += [identity.to_bytes(_CODEBOOK_ID_SIZE, "little") for identity in tile.codebook_ids]
     index = b"".join(parts)
-    return index + zlib.crc32(index).to_bytes(4, "little")
+    return index + zlib.crc32(index).to_bytes(_CRC_SIZE, "little")
 
 
 def _header(index_size: int, file_size: int) -> bytes:
+    """Return the header, including its CRC (spec 4.2); sizes are in bytes."""
     header = _spec.Header(
         magic=_spec.MAGIC,
         version_major=_spec.VERSION_MAJOR,
@@ -308,4 +322,4 @@ def _header(index_size: int, file_size: int) -> bytes:
         header_crc=0,
     )
     fixed = _spec.pack_header(header)[: _spec.HEADER_OFFSETS["header_crc"]]
-    return fixed + zlib.crc32(fixed).to_bytes(4, "little")
+    return fixed + zlib.crc32(fixed).to_bytes(_CRC_SIZE, "little")

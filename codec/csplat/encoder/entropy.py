@@ -236,6 +236,7 @@ def _block_head(attribute: int, coding: int) -> bytes:
 
 
 def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    """Return parameters, offsets and stream of integers [C, n]: the offset of a column is its smallest integer."""
     offsets = integers.min(axis=1).astype("<i4")
     elements = integers - offsets.astype(integers.dtype)[:, None]
     stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
@@ -331,6 +332,7 @@ def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, byt
 
 
 def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
+    """Compress with the library and the level of the settings; zlib has no levels above 9."""
     if deflate.library == "zlib":
         return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
     if deflate.level <= _FASTEST_LEVEL:

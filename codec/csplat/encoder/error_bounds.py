@@ -167,6 +167,7 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
 
 
 def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any], part: slice) -> ErrorSums:
+    """Return the errors of the decoded splats `part` against the rows [n] of the source; missing bands are 0."""
     pairs = {
         "means": distance_errors(take_precise_means(source, rows).T, decoded.means[part].T),
         "covariance": covariance_errors(

@@ -302,6 +302,11 @@ def _reorder(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
 
 
 def _zero_coefficients(plan: EncodePlan, sh_plan: ShCodingPlan) -> NDArray[np.bool_] | None:
+    """Return a mask [N, K] of the coefficients in bands that quantise to 0 as a whole.
+
+    Returns:
+        The mask; `None` if SH has a codebook or only band 0.
+    """
     parameters = plan.parameters
     kept = parameters.sh_coefficients
     if sh_plan.book is not None or not kept:

@@ -311,6 +311,11 @@ def refine_by_metric(
 
 
 def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
+    """Check points and weights; return the weights, [N] float64, all 1 if all are 0, empty for `None`.
+
+    Raises:
+        InputError: the points are not int16 or int32 [N, D], or the weights not [N], finite and >= 0.
+    """
     if points.ndim != 2 or not points.shape[1] or points.dtype not in (np.int16, np.int32):
         actual = f"{points.dtype} {points.shape}"
         raise InputError(f"k-means: points are int16 or int32 [N, D], found {actual}")

@@ -151,6 +151,7 @@ def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -
 
 
 def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
+    """Raise an `InputError` unless the leaves hold `count` splats once each, and parents have higher levels."""
     rows = [node.rows for node in nodes if node.rows is not None]
     if not np.array_equal(np.sort(np.concatenate(rows)) if rows else [], np.arange(count)):
         raise InputError("the leaves do not hold each splat of the scene once")

@@ -280,6 +280,7 @@ def encode_tiles(
 
 
 def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan) -> list[EncodedTile]:
+    """Encode the tiles, one per thread at a time, and return them in their order; the progress counts splats."""
     threads, done = plan.context.thread_count, 0
 
     def encode_one(tile: TileSplats) -> EncodedTile:
@@ -378,6 +379,7 @@ class _TileResult:
         self.largest[measure], self.squares[measure] = errors
 
     def add_opacities(self, opacities: F32) -> None:
+        """Add the alphas [n]."""
         levels = self.parameters.opacity_levels
         q = opacity_levels(opacities, levels, square=True, multiple=self.factors.opacities)
         self.blocks.append(entropy.levels_block(q, self.parameters.deflate))
@@ -394,6 +396,16 @@ class _TileResult:
         return float(shape.decoded_scales.max())
 
     def add_means(self, source: NDArray[Any], quantised: QuantisedTile, step: float) -> None:
+        """Add the means.
+
+        Args:
+            source: [n, 3], the means before quantisation, as precise as they are known.
+            quantised: their integers, sorted.
+            step: scene units per lattice unit of the tile.
+
+        Raises:
+            InputError: a decoded mean leaves float32.
+        """
         q, deflate = quantised.q, self.parameters.deflate
         if quantised.codes is None:
             self.blocks.append(entropy.axis_block(q, deflate))
@@ -404,6 +416,7 @@ class _TileResult:
         self.add_errors("means", distance_errors(np.ascontiguousarray(source.T), decoded))
 
     def add_sh0(self, sh0: F32) -> None:
+        """Add the coefficients [n, 3]; raise an `InputError` if a decoded coefficient leaves float32."""
         parameters, source = self.parameters, np.ascontiguousarray(sh0.T)
         columns, exponent, decoded = quantise_colour(
             source, parameters.sh0_step, parameters.chroma_shift, self.factors.sh0
@@ -487,6 +500,7 @@ def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[Fi
 
 
 def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
+    """Return the payload of SERR: counts of the source, and the errors in the order of their ids (spec 5.5)."""
     model, origin = plan.model, plan.origin
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
     bounds = sorted((ids[name], *pair) for name, pair in declared_errors(errors, origin).items())
@@ -497,6 +511,7 @@ def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
 
 
 def _versions(parameters: CodingParameters) -> str:
+    """Return the versions of csplat and NumPy, and the library of DEFLATE, which determine the bytes of a file."""
     from importlib.metadata import PackageNotFoundError, version  # takes a tenth of the import time of the encoder
 
     try:

@@ -165,6 +165,7 @@ def lift_colour(columns: Integers, shift: int) -> Integers:
 
 
 def _round_multiples(values: Floats, kind: type[np.signedinteger[Any]], coarse: I32 | None = None) -> Integers:
+    """Round values [..., n] to integers, multiples of 2**coarse, [n]; `None`: to any integers."""
     if coarse is None:
         result: Integers = np.rint(values).astype(kind)
         return result

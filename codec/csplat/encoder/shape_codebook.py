@@ -308,6 +308,7 @@ class _ShapeInput:
 def _shape_input(
     model: SplatModel, weights: F32, metric: ErrorMetric | None, parameters: CodingParameters
 ) -> _ShapeInput:
+    """Return the shapes of a model in canonical axis order, and their rate and distortion; weights are [N]."""
     rotation, scales = _canonical(model.quats, model.scales, parameters)
     covariances, sizes = unit_covariances(rotation, scales)
     fits = np.abs(scales).max(axis=0) < _STEPS_MAX * parameters.scale_step
@@ -315,15 +316,18 @@ def _shape_input(
     q = quat_levels(rotation, parameters.quat_levels)
     decoded, decoded_sizes = unit_covariances(quat_values(q, parameters.quat_levels), n * parameters.scale_step)
     bits = sum(_entropy(column[fits]) for column in (*n, *q))
-    plain = _covariance_errors(covariances, decoded, decoded_sizes - sizes, weights, metric)
+    plain = _shape_errors(covariances, decoded, decoded_sizes - sizes, weights, metric)
     return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 
 
-def _covariance_errors(target: F64, coded: F64, growth: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
-    """Return the weighted squared errors [N] of `coded` · e^(2 · growth) against `target`, both [6, N]."""
-    difference = _vectors(coded * np.exp(2.0 * np.clip(growth, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
+def _shape_errors(target: F64, coded: F64, log_growth: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
+    """Return the weighted squared errors [N] of `coded` · e^(2 · log_growth) against `target`, both [6, N].
+
+    With a metric, its own weights count, and `weights` [N] is not used.
+    """
+    difference = _vectors(coded * np.exp(2.0 * np.clip(log_growth, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
     if metric is not None:
-        return metric.errors(difference[:, :, None], slice(None))
+        return metric.errors(difference[:, :, None], slice(None))  # slice(None): all splats
     return np.asarray(np.einsum("ni,ni->n", difference, difference) * weights)
 
 
@@ -384,16 +388,16 @@ def _assignment_errors(shapes: _ShapeInput, entries: I32, index: I64, parameters
     """Return the weighted squared error of each splat's assignment, [N], and the summand that minimises it, [N]."""
     decoded, sizes = _dequantise(entries, parameters)
     assigned = decoded[:, index]
-    growth = (
-        np.zeros(len(index)) if shapes.metric is None else _best_growth(shapes.covariances, assigned, shapes.metric)
-    )
-    steps = (shapes.sizes + growth - sizes[index]) / parameters.scale_step
+    log_growth = np.zeros(len(index))
+    if shapes.metric is not None:
+        log_growth = _best_log_growth(shapes.covariances, assigned, shapes.metric)
+    steps = (shapes.sizes + log_growth - sizes[index]) / parameters.scale_step
     summand = np.rint(np.where(shapes.fits, steps, 0.0)).astype(np.int32)
-    growth = sizes[index] + summand * parameters.scale_step - shapes.sizes
-    return _covariance_errors(shapes.covariances, assigned, growth, shapes.weights, shapes.metric), summand
+    log_growth = sizes[index] + summand * parameters.scale_step - shapes.sizes
+    return _shape_errors(shapes.covariances, assigned, log_growth, shapes.weights, shapes.metric), summand
 
 
-def _best_growth(target: F64, assigned: F64, metric: ErrorMetric) -> F64:
+def _best_log_growth(target: F64, assigned: F64, metric: ErrorMetric) -> F64:
     """Return the summand of the log scales, [N], that brings covariances `assigned` closest to `target`, both [6, N].
 
     A summand t scales a covariance a by s = e^(2t). The error (s a - b)ᵀ M (s a - b) is least for s = aᵀ M b / aᵀ M a.

@@ -312,6 +312,17 @@ def doubled_triangles(triangles: Floats) -> F64:
 
 
 def _make_metric(name: str, weights: F32, values: Floats, size: int) -> ErrorMetric:
+    """Return the metric of a part of the importance.
+
+    Args:
+        name: name of the part in messages.
+        weights: [N].
+        values: upper triangles, [N, D (D + 1) / 2].
+        size: D.
+
+    Raises:
+        InputError: the triangles have another shape, are no floats, or are not finite.
+    """
     shape = (len(weights), size * (size + 1) // 2)
     if values.shape != shape or values.dtype.kind != "f":
         raise InputError(f"importance has {name} {values.dtype} {list(values.shape)}, expected floats {list(shape)}")

@@ -307,6 +307,7 @@ def _lost_contents(file_format: Format, levels: Sequence[Scene]) -> list[Finding
 
 
 def _clamped_values(file_format: Format, levels: Sequence[Scene], statistics: ClampStatistics) -> list[Finding]:
+    """Return findings about values that a writer clamped, each with the other formats that hold such values."""
     degree = max((scene.sh_degree for scene in levels), default=0)
 
     def holders(name: str, least: float, most: float) -> list[str]:
@@ -384,6 +385,7 @@ def format_by_name(name: str) -> Format:
 
 
 def _write_csplat(path: Path, scene: Scene) -> None:
+    """Write a file with the default options and all extra columns (`Format.write`)."""
     from csplat.encode_api import encode  # imported lazily: reading does not load the encoder
     from csplat.encoder import EncodeOptions
 
@@ -413,6 +415,7 @@ _CSPLAT_FORMAT = Format(
 
 
 def _own_formats() -> dict[str, Format]:
+    """Return the built-in formats by name, in the order of lists."""
     # Imported lazily: the libraries of these formats delay the start of programs that do not need them.
     from csplat.formats import compressed_ply, gltf, ksplat, sog, splat, spz
 

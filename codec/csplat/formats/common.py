@@ -88,6 +88,7 @@ def _count_empty_rows(rows: Rows) -> int:
 
 
 def _finite_rows(rows: Rows) -> NDArray[np.bool_]:
+    """Return a mask [N] of the rows without NaN and infinity; columns of integers are not checked."""
     good = np.ones(len(rows), bool)
     for name in rows.dtype.names or ():
         if rows.dtype[name].base.kind == "f" and rows[name].size:
@@ -520,6 +521,11 @@ class _ZCurve:
 
     @classmethod
     def through(cls, scene: Scene) -> _ZCurve:
+        """Fit the curve to a sample of the scene; reads all blocks.
+
+        Raises:
+            InputError: the blocks have another number of splats than the scene.
+        """
         stride = -(-scene.count // _CURVE_SAMPLE) or 1
         samples, at = [np.zeros((0, 3), np.float32)], 0
         for model in scene.blocks():

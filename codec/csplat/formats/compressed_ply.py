@@ -57,6 +57,7 @@ class _Element:
     dtype: np.dtype[Any]
 
     def read(self, path: Path, start: int, stop: int) -> NDArray[Any]:
+        """Read the rows from `start` to `stop`; raise an `InputError` if the file became shorter."""
         with open_binary(path) as stream:
             stream.seek(self.offset + start * self.dtype.itemsize)
             rows = np.fromfile(stream, self.dtype, stop - start)
@@ -67,6 +68,11 @@ class _Element:
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
+    """Open a file (`Format.open`).
+
+    Raises:
+        InputError: the file is not a complete compressed PLY, or its bounds are not finite or crossed.
+    """
     elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
@@ -161,6 +167,7 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
+    """Raise an `InputError` unless an element has all wanted columns, of the NumPy type `kind`."""
     fields: Any = element.dtype.fields or {}
     for column in wanted:
         if column not in fields or fields[column][0] != np.dtype(kind):
@@ -302,6 +309,7 @@ def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
 
 
 def _build_header(scene: Scene, count: int, rest: int) -> bytes:
+    """Return the header; `rest` is the number of SH columns, 0 without an element for SH."""
     lines = [
         "ply",
         "format binary_little_endian 1.0",

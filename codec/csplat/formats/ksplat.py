@@ -82,6 +82,11 @@ class _SectionHead(NamedTuple):
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
+    """Open a file (`Format.open`).
+
+    Raises:
+        InputError: the file is truncated, of another version, or contradicts itself.
+    """
     data = map_file(path)
     if len(data) < _HEADER_SIZE:
         raise InputError(f"{path.name} is truncated: it ends within its header")
@@ -121,6 +126,7 @@ def _open(path: Path) -> Iterator[Scene]:
 
 
 def _row_type(level: int, degree: int) -> np.dtype[Any]:
+    """Return the type of the rows of a section, by its compression level and SH degree."""
     means, others, rest = _TYPES[level]
     return np.dtype(
         [
@@ -181,6 +187,7 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
 
 
 def _section_blocks(section: _Section) -> Iterator[tuple[Rows, ...]]:
+    """Yield blocks of rows [n], the corner of the bucket of each row [n, 3], and its step [n, 1]."""
     for start in range(0, len(section.rows), BLOCK_SPLATS):
         rows = section.rows[start : start + BLOCK_SPLATS]
         bucket = np.searchsorted(section.ends, np.arange(start, start + len(rows)), side="right")

@@ -38,6 +38,7 @@ _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(2
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:
+    """Open a file (`Format.open`); raise an `InputError` if its size is not a multiple of the size of a row."""
     data = map_file(path)
     if len(data) % _ROW.itemsize:
         raise InputError(f"{path.name} has {len(data):,} bytes, expected a multiple of {_ROW.itemsize} (.splat)")
@@ -81,6 +82,7 @@ def _doubt(path: Path) -> str:
 
 
 def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
+    """Decode rows [n], with log scales [n, 3] that were computed from them."""
     return SplatModel(
         means=rows["means"].astype(np.float32),
         quats=normalise_quats(np.subtract(rows["quats"], _QUAT_ZERO, dtype=np.float32)),
@@ -91,6 +93,7 @@ def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
 
 
 def _write(path: Path, scene: Scene) -> None:
+    """Write a file (`Format.write`): SH of degree 0 and no metadata."""
     with atomic_writer(path) as stream:
         for model in scene.blocks():
             rows = np.empty(len(model), _ROW)

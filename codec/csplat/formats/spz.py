@@ -142,6 +142,16 @@ def read_spz_file(file: BinaryIO, name: str, size: int) -> SpzArrays:
 
 
 def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
+    """Read the header.
+
+    Args:
+        name: name of the file, for messages.
+        size: bytes of the file, which limit the number of splats.
+        stream: the unpacked bytes, at their beginning.
+
+    Raises:
+        InputError: the file is not SPZ, has contents that csplat does not read, or too many splats for its size.
+    """
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_read_exactly(name, stream, _HEADER.size))
     if magic != _MAGIC:
         raise InputError(f"{name} is not SPZ: it begins with {magic!r}, expected {_MAGIC!r}")
@@ -216,6 +226,7 @@ def _read_extensions(packed: SpzArrays, data: bytes) -> int:
 
 
 def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
+    """Read `size` bytes; raise an `InputError` if the stream ends before."""
     data = stream.read(size)
     if len(data) < size:
         raise InputError(f"{name} is not SPZ, or is truncated")
@@ -223,6 +234,7 @@ def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
 
 
 def _fill(name: str, stream: Any, data: U8) -> None:
+    """Read as many bytes as `data` has into it; raise an `InputError` if the stream ends before."""
     at = 0
     while at < len(data):
         byte_count = stream.readinto(data[at : at + _PIECE])  # in pieces, because gzip copies each read
@@ -241,6 +253,7 @@ _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    """Open a file (`Format.open`, `Format.open_bands`)."""
     with open_binary(path) as file:
         packed = read_spz_file(file, path.name, path.stat().st_size)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
@@ -341,6 +354,7 @@ def _choose_fraction_bits(path: Path, scene: Scene) -> int:
 
 
 def _encode_block(model: SplatModel, bits: int) -> tuple[U8, ...]:
+    """Encode splats to bytes, [n, width] per attribute, in the order of the file; positions have fractional `bits`."""
     fixed = np.rint(model.means * np.float32(2.0**bits)).astype("<i4")
     rest = np.rint(model.shN * np.float32(128 / _SH_STEP)) * np.float32(_SH_STEP) + np.float32(128)
     return (

@@ -77,6 +77,7 @@ def check_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
 
 
 def _remark_cameras(log: ViolationLog, cameras: list[dict[str, Any]]) -> None:
+    """Add a remark about the first camera without a usual key."""
     for i, camera in enumerate(cameras):
         missing = [key for key in _CAMERA_KEYS if key not in camera]
         if missing:
@@ -100,6 +101,7 @@ class _Scanner:
         self.at = match.end() if match else self.at
 
     def taken(self, character: str) -> bool:
+        """Step over white space and over a character, if it is next; return True if it was."""
         self.skip()
         if self.text.startswith(character, self.at):
             self.at += len(character)
@@ -107,6 +109,7 @@ class _Scanner:
         return False
 
     def value(self, depth: int) -> Any:
+        """Read a value within `depth` arrays and objects."""
         self.skip()
         first = self.text[self.at : self.at + 1]
         if first in ("{", "["):
@@ -122,6 +125,7 @@ class _Scanner:
         return self.number()
 
     def object(self, depth: int) -> dict[str, Any]:
+        """Read an object after its brace."""
         result: dict[str, Any] = {}
         if self.taken("}"):
             return result
@@ -141,6 +145,7 @@ class _Scanner:
                 raise self.error("neither comma nor end of an object")
 
     def array(self, depth: int) -> list[Any]:
+        """Read an array after its bracket."""
         result: list[Any] = []
         if self.taken("]"):
             return result
@@ -152,6 +157,7 @@ class _Scanner:
                 raise self.error("neither comma nor end of an array")
 
     def string(self) -> str:
+        """Read a string; one that is not Unicode text is an error."""
         match = _STRING.match(self.text, self.at)
         if match is None:
             raise self.error("no string")
@@ -165,6 +171,7 @@ class _Scanner:
         return value
 
     def number(self) -> float:
+        """Read a number, finite in binary64."""
         match = _NUMBER.match(self.text, self.at)
         if match is None:
             raise self.error("no value")

@@ -14,6 +14,8 @@ import numpy as np
 from csplat import _spec
 from csplat_conformance.validator.violation_log import Payload, PlacedRecord, ViolationLog, read_record
 
+# Bits that are not ancillary (ANC-1), written by hand to check the registry.
+_REGISTERED_FLAGS, _REGISTERED_SCENE_FLAGS = 0x00FF, 0x0F
 #: Bytes of the fields that this version knows.
 _SIZES_MIN = {
     "head": _spec.INDEX_HEAD_SIZE,
@@ -24,6 +26,7 @@ _SIZES_MIN = {
     "tile": _spec.TILE_RECORD_SIZE,
     "layer": _spec.LAYER_RECORD_SIZE,
 }
+_CODEBOOK_ID_SIZE = 2  # bytes
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
@@ -119,6 +122,7 @@ def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> in
 
 
 def _check_head(log: ViolationLog, head: Head) -> None:
+    """Check the index head: RES-1, IDX-3 to IDX-6, IDX-8."""
     record = head.record
     log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
@@ -127,7 +131,7 @@ def _check_head(log: ViolationLog, head: Head) -> None:
             log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
         log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
-    unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
+    unlisted = record.scene_flags & _REGISTERED_SCENE_FLAGS & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
@@ -146,6 +150,7 @@ def _check_head(log: ViolationLog, head: Head) -> None:
 
 
 def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
+    """Read the attribute records from `at` on, check RES-1 and ATT-1 to ATT-10, and return the end offset."""
     count = index.head.record.attribute_count
     bands = 0 if index.degree is None else index.degree
     expected = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
@@ -167,6 +172,7 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: Vio
 
 
 def _check_attribute(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
+    """Check ATT-2 and ATT-8 to ATT-10, and the clauses of levels and lattices."""
     record = placed.record
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
     if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
@@ -185,6 +191,7 @@ def _check_attribute(log: ViolationLog, placed: AttributeAt, index: Index) -> No
 
 
 def _check_levels(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
+    """Check ATT-3, ATT-4 and ATT-7; add valid levels to the index."""
     record = placed.record
     clause, low, high = "ATT-4", _spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX
     if record.attribute == _spec.ATTRIBUTE_OPACITIES:
@@ -198,6 +205,7 @@ def _check_levels(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
 
 
 def _check_lattice(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
+    """Check ATT-5, ATT-6 and ATT-10; add a valid step to the index."""
     record = placed.record
     if record.levels:
         log.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, expected 0")
@@ -221,9 +229,10 @@ def _is_single(step: Fraction) -> bool:
 
 
 def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
+    """Read the codebook records from `at` on, check RES-1 and CBR-1 to CBR-4, and return the end offset."""
     last = -1
     for _ in range(_count_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
-        identity = int.from_bytes(view[at : at + 2], "little")
+        identity = int.from_bytes(view[at : at + _CODEBOOK_ID_SIZE], "little")
         name = f"codebook[{identity}]"
         placed = read_record(view, _spec.CodebookRecord, at, name)
         log.check_reserved(placed)
@@ -238,6 +247,7 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: Viol
 
 
 def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> bool:
+    """Check RES-2, CBR-2 and CBR-4; return True if they hold."""
     record = placed.record
     before = len(log.violations)
     first, last = record.band_first, record.band_last
@@ -258,6 +268,7 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
 
 
 def _read_extras(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
+    """Read the extra column records from `at` on, check RES-2 and EXR-1 to EXR-3, and return the end offset."""
     names: set[str] = set()
     for i in range(_count_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
         placed = read_record(view, _spec.ExtraRecord, at, f"extra[{i}]")
@@ -274,6 +285,7 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, log: Violati
 
 
 def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
+    """Check EXR-2 and EXR-3, and add the name to the `names` of the columns before."""
     raw = placed.record.name[: placed.record.name_size]
     rest = placed.record.name[placed.record.name_size :]
     if any(rest):
@@ -388,6 +400,7 @@ def _chunk_name(record: _spec.DirectoryRecord, known: list[str]) -> str:
 
 
 def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) -> None:
+    """Check type and flags of a directory record: DIR-1, DIR-2, DIR-6, RES-1, CHK-4."""
     record = placed.record
     kind = record.type
     if kind == _spec.CHUNK_TILE:
@@ -395,7 +408,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
         log.add_field("DIR-1", placed, "type", f"{kind!r}, expected bytes 0x20 to 0x7E")
-    flags = record.flags & 0x00FF  # the other bits are ancillary
+    flags = record.flags & _REGISTERED_FLAGS
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
@@ -409,6 +422,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
 
 
 def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
+    """Check DIR-4: there is at most one chunk of certain types, with id and layer 0."""
     seen = set()
     for chunk in chunks:
         if chunk.kind not in _SINGLE_CHUNKS:
@@ -422,6 +436,7 @@ def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
 
 
 def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: Index, start: int) -> None:
+    """Check DIR-5, if all codebook records are valid; `start` is the offset of the directory."""
     if len(index.codebooks) != index.head.record.codebook_count:
         return  # violations of the other records were already added
     required = {
@@ -440,28 +455,29 @@ def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: In
         log.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
 
 
-def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
-    """Check COV-1, mark the readable chunks, and add a remark if the order differs from 4.3.6.
+def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], index_end: int, file_size: int, data_size: int) -> None:
+    """Check COV-1, set `whole` of the chunks, and add a remark if the order differs from 4.3.6.
 
     Args:
         log: receives the violations.
-        chunks: all chunks of the file.
-        start: end of the index.
-        file_size: size of the file in the header.
-        data_size: size of the data.
+        chunks: all chunks of the file; `whole` is set to True if a chunk can be read.
+        index_end: end of the index, where the first chunk starts.
+        file_size: size that the header declares.
+        data_size: size of the bytes at hand, which may be truncated.
     """
     ordered = sorted(chunks, key=lambda chunk: (chunk.offset, chunk.size))
-    expected = covered = start
+    expected = index_end
+    read_end = index_end  # end of the last whole chunk
     for chunk in ordered:
         if chunk.offset != expected:
             log.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, expected {expected}")
         end = chunk.offset + chunk.size
         # Overlapping chunks are not read, because a file could list the same bytes a million times.
-        chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
+        chunk.whole = read_end <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
         if not chunk.whole:
             log.skip(chunk.name, "its bytes are missing, or belong to another chunk")
         expected = end
-        covered = max(covered, end) if chunk.whole else covered
+        read_end = max(read_end, end) if chunk.whole else read_end
     if expected != file_size:
         log.add(
             "COV-1",
@@ -563,14 +579,16 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, log: Violation
 
 
 def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
+    """Return the size of the tile record at `at` with its layer records and codebook ids, as far as it is known."""
     size = index.size_of("tile")
     if end - at < size:
         return size
     record = _spec.unpack_tile_record(view, at)
-    return size + record.layer_count * index.size_of("layer") + 2 * record.table_count
+    return size + record.layer_count * index.size_of("layer") + _CODEBOOK_ID_SIZE * record.table_count
 
 
 def _read_tile(view: memoryview, at: int, number: int, index: Index, log: ViolationLog) -> Tile:
+    """Read a tile record with its layer records and codebook ids, and check RES-1, RES-2 and TIL-1 to TIL-9."""
     placed = read_record(view, _spec.TileRecord, at, f"tile[{number}]")
     log.check_reserved(placed)
     tile = Tile(number, placed)
@@ -590,6 +608,7 @@ def _check_level(log: ViolationLog, tile: Tile, lowest: int) -> None:
 
 
 def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
+    """Check TIL-7 to TIL-9, and MEA-1 if they hold."""
     record, before = tile.record.record, len(log.violations)
     for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
         if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
@@ -613,6 +632,7 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
 
 
 def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
+    """Read the layer records of a tile from `at` on; check RES-1, RES-2, TIL-2, TIL-3, TIL-5 and CHK-3."""
     start, last = at, -1
     flags = registered_flags(_spec.CHUNK_TILE)
     for i in range(tile.record.record.layer_count):
@@ -643,9 +663,10 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
 
 
 def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
+    """Read the codebook ids of a tile from `at` on, and check TIL-6."""
     last = -1
     for k in range(tile.record.record.table_count):
-        identity = int.from_bytes(view[at : at + 2], "little")
+        identity = int.from_bytes(view[at : at + _CODEBOOK_ID_SIZE], "little")
         name = f"{tile.record.name}.table[{k}]"
         if identity <= last:
             log.add("TIL-6", at, name, f"{identity} after {last}, expected ascending ids")
@@ -653,4 +674,4 @@ def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log:
             log.add("TIL-6", at, name, f"there is no codebook {identity}")
         tile.codebook_ids.add(identity)
         last = max(last, identity)
-        at += 2
+        at += _CODEBOOK_ID_SIZE

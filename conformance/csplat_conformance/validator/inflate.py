@@ -72,6 +72,7 @@ class Inflater:
         raise CodedError(clause, message)
 
     def _number(self, count: int) -> int:
+        """Read an integer of `count` bits, the lowest first."""
         at, end = self._at, self._at + count
         if end > 8 * len(self._coded):
             raise CodedError("COD-2", "the DEFLATE stream has no end")
@@ -80,6 +81,7 @@ class Inflater:
         return piece >> (at & 7) & (1 << count) - 1
 
     def _read_stored(self) -> None:
+        """Read a stored block, which begins at the next whole byte."""
         self._at = 8 * self.used
         size, complement = self._number(16), self._number(16)
         if size ^ complement != 0xFFFF:
@@ -113,6 +115,7 @@ class Inflater:
         return _Code(of_literals), _Code(of_distances)
 
     def _lengths(self, code: _Code, count: int) -> list[int]:
+        """Read `count` code lengths, which `code` compresses."""
         lengths: list[int] = []
         while len(lengths) < count:
             symbol = self._symbol(code)

@@ -145,6 +145,18 @@ def _check_coder(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> boo
 def _elements(
     log: ViolationLog, head: PlacedRecord[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
 ) -> Elements | None:
+    """Undo the transforms of a stream, and check TRF-1.
+
+    Args:
+        log: receives the violations.
+        head: the stream head.
+        packed: `packed_size` bytes.
+        coded_at: offset of the coded bytes.
+        signed: elements are signed integers.
+
+    Returns:
+        [count]; `None` if TRF-1 does not hold.
+    """
     record = head.record
     data = np.frombuffer(packed, np.uint8)
     if _spec.TRANSFORM_RUN_LENGTH in record.transforms:

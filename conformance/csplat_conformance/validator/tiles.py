@@ -92,6 +92,16 @@ class TileChecker:
         return [attribute for attribute, attribute_layer in _spec.ATTRIBUTE_LAYER.items() if attribute_layer == layer]
 
     def _read_block(self, payload: Payload, expected: int, number: int) -> None:
+        """Read the next block of a layer.
+
+        Args:
+            payload: the payload, at the block head.
+            expected: attribute of the block by the order of the layer.
+            number: index of the block in the layer.
+
+        Raises:
+            UnreadableError: attribute or coding are not known, so neither is the size of the block.
+        """
         at = payload.at
         attribute = payload.view[at] if payload.left else expected
         name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
@@ -167,6 +177,7 @@ class TileChecker:
         check_max_scale(self.log, self.index, largest, exponent, stored, where)
 
     def _read_means(self, payload: Payload, name: str, coding: int) -> None:
+        """Check MOR-1, MOR-2, AXI-1 and TIL-10."""
         count, width_max = self.tile.count, _spec.CODING_WIDTH_MAX[coding]
         rows: I64 | None
         if coding == _spec.CODING_MORTON:
@@ -193,6 +204,7 @@ class TileChecker:
             check_box(self.log, record.record, rows, (record.at("corner"), record.path("corner")))
 
     def _read_raw(self, payload: Payload, name: str, number: int) -> None:
+        """Check RAW-1 and RAW-2; `number` is the index of the column."""
         params = payload.structure(_spec.RawParams, f"{name}.params")
         if params.record.column != number:
             self.log.add_field("RAW-1", params, "column", f"{params.record.column}, expected {number}")

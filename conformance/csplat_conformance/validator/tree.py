@@ -20,7 +20,7 @@ class _Node:
         level: level of its tiles; `None` if they are unknown or have several levels.
         splat_count: number of splats; `None` if its tiles are unknown.
         children: nodes with a valid `parent` that is this node.
-        has_all_children: whether no earlier node has an invalid `parent`, which may stand for this node.
+        has_all_children: True if neither this nor an earlier node has an invalid `parent`, which may stand for another.
     """
 
     record: PlacedRecord[_spec.NodeRecord]
@@ -60,18 +60,18 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
         UnreadableError: the payload does not consist of whole records.
     """
     log, start = payload.log, payload.at
-    count, rest = divmod(payload.left, _spec.NODE_RECORD_SIZE)
+    record_count, rest = divmod(payload.left, _spec.NODE_RECORD_SIZE)
     if rest:
         payload.at = payload.end - rest
         message = f"the payload ends within the record, {rest} of {_spec.NODE_RECORD_SIZE} bytes are left"
-        log.add("TRE-2", payload.at, f"{payload.name}/node[{count}]", message)
+        log.add("TRE-2", payload.at, f"{payload.name}/node[{record_count}]", message)
         raise UnreadableError
     # Each node has a tile, so one of these nodes breaks TRE-3 if there are more nodes than tiles.
-    nodes = [_Node(payload.structure(_spec.NodeRecord, f"node[{n}]")) for n in range(min(count, len(tiles) + 1))]
+    nodes = [_Node(payload.structure(_spec.NodeRecord, f"node[{n}]")) for n in range(min(record_count, len(tiles) + 1))]
     _assign_tiles(log, nodes, tiles, (start, f"{payload.name}/node"))
     if payload.left:
         log.skip(f"{payload.name} from byte {payload.at} on", "there are more nodes than tiles")
-    _find_children(log, nodes, count)
+    _find_children(log, nodes, record_count)
     for node in nodes:
         _check_node(log, node)
 
@@ -98,12 +98,15 @@ def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Til
         node.level, node.splat_count = level, splat_count
 
 
-def _find_children(log: ViolationLog, nodes: Sequence[_Node], count: int) -> None:
-    """Check TRE-5, and set the children of the nodes."""
+def _find_children(log: ViolationLog, nodes: Sequence[_Node], record_count: int) -> None:
+    """Check TRE-5; set `children` and `has_all_children` of the nodes.
+
+    `record_count` includes records that were not read.
+    """
     all_valid = True
     for n, node in enumerate(nodes):
         parent = node.record.record.parent
-        if parent != _spec.NO_PARENT and not _is_above(nodes, count, n, parent):
+        if parent != _spec.NO_PARENT and not _is_above(nodes, record_count, n, parent):
             log.add_field("TRE-5", node.record, "parent", f"{parent}, expected a node of a higher level, or none")
             all_valid = False
         elif parent < len(nodes):
@@ -111,10 +114,10 @@ def _find_children(log: ViolationLog, nodes: Sequence[_Node], count: int) -> Non
         node.has_all_children = all_valid
 
 
-def _is_above(nodes: Sequence[_Node], count: int, n: int, parent: int) -> bool:
+def _is_above(nodes: Sequence[_Node], record_count: int, n: int, parent: int) -> bool:
     """Return False if node `parent` does not exist, or certainly does not have a higher level than node `n`."""
     if parent >= len(nodes):
-        return parent < count
+        return parent < record_count
     level, below = nodes[parent].level, nodes[n].level
     return parent > n if level is None or below is None else level > below
 

@@ -99,6 +99,14 @@ def _check(
     splats_max: int | None,
     progress: Callable[[str, float], None],
 ) -> None:
+    """Check a file from its beginning as far as it can be read.
+
+    Args:
+        view: the file.
+        log: receives the violations.
+        counts: receives the numbers of splats and tiles.
+        json_bytes_max, splats_max, progress: as in `validate`.
+    """
     header = _read_header(view, log)
     if header is None:
         log.skip("everything after magic and version", "not a file of this version")
@@ -225,6 +233,7 @@ def _read_tile_chunks(
     log: ViolationLog,
     progress: Callable[[str, float], None],
 ) -> None:
+    """Check the chunks of all tiles; `books` are the codebooks that could be read."""
     let_go = PageReleaser(view)
     for tile in tiles:
         progress(_STAGE, tile.index / len(tiles))

@@ -46,6 +46,7 @@ def _check_levels(log: ViolationLog, rows: I64, levels: int, where: Place) -> No
 
 
 def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
+    """Check QUA-1 and QUA-2 of integers [3, n]."""
     largest = max(abs(int(rows.min())), abs(int(rows.max())))
     if largest > levels:
         log.add("QUA-1", *where, f"a component of magnitude {largest}, expected at most {levels}")
@@ -61,6 +62,7 @@ def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> Non
 def _check_lattice(
     log: ViolationLog, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
 ) -> None:
+    """Check LAT-4, and LAT-5 if it holds, of integers [C, n]."""
     third = len(rows) // 3
     for column, row in enumerate(rows):
         shift = record.chroma_shift if column >= third and record.mapping == _spec.MAPPING_YCOCG else 0

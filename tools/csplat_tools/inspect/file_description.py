@@ -35,6 +35,7 @@ from csplat_tools.scene_files import findings_as_json
 
 _NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
 _STREAM_CLAUSE = "STR-6"
+_OFFSET_SIZE = 4  # bytes of a column's offset, i32
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,8 @@ class FileDescription:
         attributes, layers: attributes and layers by name, in the order of the registry; of all levels of detail.
         levels: levels of detail, finest first; empty if level 0 is the only level.
         codebooks: codebooks in the order of the index.
-        overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
-            chunks.
+        overhead: bytes outside attributes, by name: header, index, chunks of the whole file by type, layers of unknown
+            ids if there are any, frames of the tiles' chunks.
         metadata: metadata of the scene.
         options: the encoder's record of its options; `None` if there is none.
         declared_bounds: the declared error bounds, and counts of the source.
@@ -396,6 +397,7 @@ def _bits(size_bytes: int, count: int) -> float | None:
 
 
 def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> AttributeSummary:
+    """Return the summary of an attribute; one without a record has no mapping, step or levels."""
     record = next((entry for entry in header.attributes if _spec.ATTRIBUTE_NAMES[entry.attribute] == name), None)
     known: dict[str, Any] = {}
     if record is not None:
@@ -416,6 +418,7 @@ def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> Attribute
 
 
 def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
+    """Return the layers by name, ascending by id, with their codebook chunks; "layer 128" for an unknown id."""
     tile_bytes, tile_count, codebook_bytes = Counter[int](), Counter[int](), Counter[int]()
     for tile in header.all_tiles:
         for id_, layer in tile.layers.items():
@@ -434,6 +437,7 @@ def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
 
 
 def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
+    """Return the levels of detail, finest first; empty if level 0 is the only level."""
     if not header.coarse_tiles:
         return []
     nodes = read_nodes(memoryview(data), header)
@@ -449,13 +453,26 @@ def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
 
 
 def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
-    whole = {chunk.type.decode("ascii"): chunk.size for chunk in header.directory if chunk.type != _spec.CHUNK_CODEBOOK}
-    parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **whole}
+    """Return the bytes outside attributes, by name; together with those of all attributes they are the file's size.
+
+    Chunks of one type, of which a file may have several if it is unknown, are added up. "unknown_layers", if there are
+    any, are chunks of the tiles' layers of unknown ids.
+    """
+    by_type = Counter[str]()
+    for chunk in header.directory:
+        if chunk.type != _spec.CHUNK_CODEBOOK:
+            by_type[chunk.type.decode("ascii")] += chunk.size
+    layers = (item for tile in header.all_tiles for item in tile.layers.items())
+    unknown = sum(layer.size for id_, layer in layers if id_ not in _spec.LAYER_NAMES)
+    parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **by_type}
+    if unknown:
+        parts["unknown_layers"] = unknown
     rest = header.file_size - sum(parts.values()) - sum(usage.size_bytes for usage in use.values())
     return {**parts, "tile_frames": rest}
 
 
 def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSummary:
+    """Return the summary of a codebook; only codebooks of SH have bands."""
     chunks = [chunk for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK]
     return CodebookSummary(
         record.codebook_id,
@@ -467,6 +484,7 @@ def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSumm
 
 
 def _bounds_as_json(bounds: DeclaredBounds) -> dict[str, Any]:
+    """Return the declared bounds as JSON-compatible values."""
     return {
         "source_splats": bounds.source_count,
         "pruned_splats": bounds.pruned_count,
@@ -490,6 +508,7 @@ class _Cursor:
         return data
 
     def skip(self, size: int) -> None:
+        """Step over `size` bytes; raise a `FormatError` if the payload has fewer."""
         if size > self.end - self.at:
             raise FormatError(
                 _spec.ERROR_STREAM, self.at, _STREAM_CLAUSE, found=f"{self.end - self.at} bytes", wanted=size
@@ -498,6 +517,7 @@ class _Cursor:
 
 
 def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], use: dict[int, AttributeUsage]) -> None:
+    """Add the blocks of a layer to the usage by attribute id; the cursor is at the tile head."""
     head = _spec.unpack_tile_head(cursor.take(_spec.TILE_HEAD_SIZE))
     for _ in range(head.block_count):
         start = cursor.at
@@ -512,11 +532,12 @@ def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], u
 def _walk_coding(
     cursor: _Cursor, attribute: int, coding: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
 ) -> None:
+    """Step over parameters and streams of a block, after its head, and add their coders to `use`."""
     columns = _spec.ATTRIBUTE_COLUMNS.get(attribute, 1)
     if coding == _spec.CODING_MORTON:
         cursor.skip(_spec.MORTON_PARAMS_SIZE)
     elif coding == _spec.CODING_OFFSET:
-        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4 * columns)
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + _OFFSET_SIZE * columns)
     elif coding == _spec.CODING_SIGNED:
         cursor.skip(_spec.LATTICE_PARAMS_SIZE)
     elif coding == _spec.CODING_RAW:
@@ -533,6 +554,7 @@ def _walk_coding(
 def _walk_codebook(
     cursor: _Cursor, attribute: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
 ) -> None:
+    """Step over a CODEBOOK block, after its head, with its escape block; add coders and escapes to `use`."""
     at = cursor.at
     params = _spec.unpack_codebook_params(cursor.take(_spec.CODEBOOK_PARAMS_SIZE))
     record = codebooks.get(params.codebook_id)
@@ -541,7 +563,7 @@ def _walk_codebook(
     if attribute == _first_attribute(record, record.band_first):
         _walk_stream(cursor, use)
     if attribute == _spec.ATTRIBUTE_SCALES:
-        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4)
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + _OFFSET_SIZE)
         _walk_stream(cursor, use)
     use.escaped_count += params.escape_count
     if params.escape_count:
@@ -552,6 +574,7 @@ def _walk_codebook(
 
 
 def _walk_stream(cursor: _Cursor, use: AttributeUsage) -> None:
+    """Step over a stream, and add its coder to `use`."""
     at = cursor.at
     head = _spec.unpack_stream_head(cursor.take(_spec.STREAM_HEAD_SIZE))
     use.coders[_name(_spec.CODER_NAMES, head.coder, "coder", at)] += 1
@@ -574,6 +597,7 @@ def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
 
 
 def _tiles(file: FileDescription) -> str:
+    """Describe number, sizes, precision and exponents of the tiles of level 0 in words."""
     words = {
         name: str(span.min) if span.min == span.max else f"{span.min} to {span.max}"
         for name, span in file.spans.items()

@@ -135,6 +135,7 @@ def _compare(data: bytes | mmap, source: str, context: Context) -> _SourceCompar
 
 
 def _bytes(description: FileDescription) -> str:
+    """Return the section on the bytes of each attribute, and of everything else."""
     sizes = {name: attribute.size_bytes for name, attribute in description.attributes.items()}
     sizes["overhead"] = sum(description.overhead.values())
     rows = [
@@ -154,6 +155,7 @@ def _bytes(description: FileDescription) -> str:
 
 
 def _layers(description: FileDescription) -> str:
+    """Return the section on the layers."""
     size = description.header.file_size
     rows = [
         (name, _LAYERS.get(name, ""), f"{layer.size_bytes:,}", f"{100.0 * layer.size_bytes / size:.1f} %")
@@ -164,6 +166,7 @@ def _layers(description: FileDescription) -> str:
 
 
 def _bounds(bounds: DeclaredBounds | None) -> str:
+    """Return the section on declared error bounds; empty if there are none."""
     if bounds is None:
         return ""
     text = (
@@ -182,6 +185,7 @@ def _bounds(bounds: DeclaredBounds | None) -> str:
 
 
 def _scene(description: FileDescription) -> str:
+    """Return the section on the scene, its options and other metadata."""
     words = {
         (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value
         for name, value in describe_scene(description).items()

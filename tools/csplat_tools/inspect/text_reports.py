@@ -64,6 +64,7 @@ def format_comparison(compared: Comparison, a: str, b: str) -> str:
 
 
 def _scene_sizes(compared: Comparison, a: str, b: str) -> str:
+    """Format sizes of two scenes, and their ratio."""
     rows = []
     for name, scene in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
         count = scene.count
@@ -75,6 +76,7 @@ def _scene_sizes(compared: Comparison, a: str, b: str) -> str:
 
 
 def _attribute_errors(attributes: AttributeErrors) -> str:
+    """Format the errors of splats by measure, and how pairs were found."""
     rows = [(name, f"{largest:.4g}", f"{rms:.4g}") for name, (largest, rms) in attributes.errors.items()]
     remark = _PAIRING[attributes.pairing]
     if attributes.unmatched:
@@ -83,6 +85,7 @@ def _attribute_errors(attributes: AttributeErrors) -> str:
 
 
 def _scores(compared: Comparison) -> str:
+    """Format the scores of renders, one line each with an explanation."""
     quality = compared.quality
     values = {
         "psnr": f"{quality.psnr:.2f} dB",
@@ -104,6 +107,7 @@ def _scores(compared: Comparison) -> str:
 
 
 def _image_scores(scores: dict[str, Any]) -> str:
+    """Format the scores of renders of both scenes against images; metrics that one lacks are left out."""
     rows = []
     for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
         a, b = scores["a"][name], scores["b"][name]
@@ -114,6 +118,7 @@ def _image_scores(scores: dict[str, Any]) -> str:
 
 
 def _ignored_lines(compared: Comparison) -> list[str]:
+    """Return a line for each scene with splats that cannot be drawn."""
     return [
         f"{counted(count, 'splat')} of {name} with NaN or infinities, not drawn"
         for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)
@@ -151,6 +156,7 @@ def format_description(description: FileDescription) -> str:
 
 
 def _level_table(levels: Sequence[LevelSummary]) -> str:
+    """Format the levels of detail."""
     rows = [
         (
             str(level.level), level.size_bytes, level.splats, level.nodes, level.tiles,
@@ -170,6 +176,7 @@ def _scene(description: FileDescription) -> str:
 def _entry_sizes(
     title: str, entries: Mapping[str, AttributeSummary | LayerSummary], file_size: int, remarks: Sequence[str]
 ) -> str:
+    """Format sizes of attributes or layers, each with its remark at the end of the line."""
     rows = [
         (
             name,
@@ -190,6 +197,7 @@ def _codebook(codebook: CodebookSummary) -> str:
 
 
 def _declared_errors(declared: DeclaredBounds) -> str:
+    """Format the counts of the source and the declared errors."""
     source = f"{counted(declared.source_count, 'splat')}, SH degree {declared.source_sh_degree}"
     lines = [f"source: {source}; {declared.pruned_count} pruned"]
     if declared.refitted:
@@ -225,6 +233,7 @@ def _verdict(bounds: BoundsVerification) -> str:
 
 
 def _measures(bounds: BoundsVerification) -> str:
+    """Format the verified errors, with measured values if those were measured."""
     if bounds.rms_verified:
         header = ("error", "declared max", "found max", "declared rms", "found rms", "")
         rows = [

@@ -97,6 +97,17 @@ def verify_file(
 
 
 def _verify_bounds(data: bytes | mmap, source: str, rows: NDArray[Any] | None, context: Context) -> BoundsVerification:
+    """Verify the declared bounds against a source, in memory if both scenes fit, else tile by tile.
+
+    Args:
+        data: the file, which conforms.
+        source: path of the source.
+        rows: source index; `None`: pairs are searched, which takes both scenes in memory.
+        context: threads, progress and memory.
+
+    Raises:
+        InputError: memory does not suffice without an index.
+    """
     opened = SplatFile.open(data)
     header, bounds = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above have not been read by the encoder

@@ -137,25 +137,32 @@ class Pruner:
         return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), NOTHING)
 
     def refit(self, kept_count: int) -> PrunedSubset:
-        """Return the kept splats, refitted to renders of the source, unless that makes held-out views worse."""
+        """Return the kept splats, refitted to renders of the source, unless that makes held-out views worse.
+
+        A refit starts from the values that the previous call returned, with half of the steps, so the result depends on
+        earlier calls. Nothing is refitted if all splats are kept or `refits` is False.
+        """
         rows = self.order.kept(kept_count)
-        pruned = model = self.source.select(rows)
-        before = after = self.check_scorer.psnr(pruned)
-        if self.refits and len(rows) < len(self.source):
-            steps = _STEPS
-            if self._last is not None:
-                model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), steps // 2
-            model = refit_splats(
-                model, self.cameras, self.references, steps=self.steps(steps), background=self.views.background,
-                context=self.context,
-            )  # fmt: skip
-            after = self.check_scorer.psnr(model)
-        is_refused = after < before
-        self._last = PrunedSubset(self, pruned if is_refused else model, rows, before, max(before, after), is_refused)
+        pruned = self.source.select(rows)
+        psnr_pruned = self.check_scorer.psnr(pruned)
+        if not self.refits or len(rows) == len(self.source):
+            self._last = PrunedSubset(self, pruned, rows, psnr_pruned, psnr_pruned, refit_refused=False)
+            return self._last
+        start, steps = pruned, _STEPS
+        if self._last is not None:
+            start, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), _STEPS // 2
+        refitted = refit_splats(
+            start, self.cameras, self.references, steps=self.scaled_steps(steps), background=self.views.background,
+            context=self.context,
+        )  # fmt: skip
+        psnr_refitted = self.check_scorer.psnr(refitted)
+        is_refused = psnr_refitted < psnr_pruned
+        model, psnr = (pruned, psnr_pruned) if is_refused else (refitted, psnr_refitted)
+        self._last = PrunedSubset(self, model, rows, psnr_pruned, psnr, is_refused)
         return self._last
 
-    def steps(self, usual: int) -> int:
-        """Return a number of steps, scaled."""
+    def scaled_steps(self, usual: int) -> int:
+        """Return a number of steps, times `steps_factor`, at least 1."""
         return max(1, round(usual * self.steps_factor))
 
 
@@ -209,7 +216,7 @@ class PrunedSubset:
             return encode_tiles(plan)
         fixed = fix_quantisation(plan, pruner.source)
         values = quantisation_aware_refit(
-            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_STEPS // (2 if tuned is None else 4)),
+            fixed, pruner.cameras, pruner.references, steps=pruner.scaled_steps(_STEPS // (2 if tuned is None else 4)),
             before=self.model, background=pruner.views.background, context=pruner.context,
         )  # fmt: skip
         start = fixed.start()

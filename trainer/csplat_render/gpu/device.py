@@ -183,6 +183,7 @@ class Device:
         return [float(end - begin) * unit * 1e-6 for begin, end in times]
 
     def _encoder(self, clear: Sequence[Any]) -> Any:
+        """Return an encoder of commands, which sets the buffers `clear` to 0 first."""
         encoder = self._device.create_command_encoder()
         for buffer in clear:
             encoder.clear_buffer(buffer)
@@ -212,6 +213,7 @@ class Device:
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
+        """Raise errors of wgpu within the context as an `InputError` with the GPU's name."""
         try:
             yield
         except self._wgpu.GPUOutOfMemoryError:
@@ -222,6 +224,7 @@ class Device:
             raise InputError(f"{self.adapter} failed: {last or type(error).__name__}") from None
 
     def _pipeline(self, name: str, entry: str) -> Any:
+        """Return the pipeline of an entry point of a pass, which is compiled once."""
         pipeline = self._pipelines.get((name, entry))
         if pipeline is None:
             module = self._device.create_shader_module(label=name, code=shader_source(name))
@@ -233,6 +236,7 @@ class Device:
 
 
 def _encode(compute: Any, calls: Sequence[Call]) -> None:
+    """Add calls to a compute pass, and end it."""
     for call in calls:
         compute.set_pipeline(call.pipeline)
         compute.set_bind_group(0, call.group)

@@ -221,6 +221,7 @@ class _TileWriter:
         opacity_levels: int,
         quat_levels: int,
     ) -> None:
+        """Set numbers of splats and words, flags, bits per field (of means: of x, y, z) and numbers of levels."""
         x, y, z = mean_bits
         self._constants[0] = 0, len(self._planes), 0, self._splats | flags
         self._constants[1] = (
@@ -236,6 +237,7 @@ class _TileWriter:
         self._constants[3] = np.asarray(sh0, np.float32).view(np.uint32)
 
     def put_band(self, band: int, packed: PackedBand, tables: SharedTables) -> None:
+        """Append a band: rows of coefficients, or an index per splat into a shared table followed by such rows."""
         rows = _pack_rows(packed.rows)
         if packed.table is None or packed.index is None:
             self.put_rows(band, rows)

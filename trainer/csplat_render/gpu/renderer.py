@@ -36,6 +36,11 @@ _PAGE_WORDS = 1 << 23
 
 _SCREEN_TILE = 16  # pixels, width and height
 _RECORD_BYTES = 16  # in each of the two buffers of records
+_PIXEL_BYTES = 16  # four numbers of binary32
+_WORD_BYTES = 4  # of keys, values and sums
+_RANGE_BYTES = 8  # first and last pair of a screen tile
+_GROUP_COUNT_BYTES = 12  # of a row of the table of workgroups, three numbers
+_CLEARED_PIXELS, _CLEARING_ROWS = 256, 64  # pixels per workgroup, and rows of workgroups that clear an image
 _LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
 _MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
 _MOST_RECORDS = 65535 * BLOCK  # workgroups of a pass
@@ -210,6 +215,14 @@ def _origin_of(scene: PackedFile | HasSplats) -> tuple[float, float, float]:
 def _tiles_of(
     scenes: Sequence[PackedFile | HasSplats], tables: SharedTables, antialiased: bool | None, sh_degree: int | None
 ) -> Iterator[TileWords]:
+    """Yield the tiles of scenes, relative to the origin of the first.
+
+    Args:
+        scenes: at least one.
+        tables: tables of coefficients that tiles share; filled.
+        antialiased: `None`: as each scene specifies.
+        sh_degree: highest SH degree; `None`: the degree of each scene.
+    """
     first = _origin_of(scenes[0])
     for scene in scenes:
         shift = np.subtract(_origin_of(scene), first)
@@ -252,10 +265,10 @@ class GpuRenderer:
         self._depths = device.buffer(4 << _DEPTH_BITS)
         # The last record draws nothing, see bin.wgsl.
         self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * (self._records + 1)) for _ in range(2))
-        keys, values = ([device.buffer(4 * self._records) for _ in range(2)] for _ in range(2))
+        keys, values = ([device.buffer(_WORD_BYTES * self._records) for _ in range(2)] for _ in range(2))
         self._order = values[0]
-        self._sums = device.buffer(4 * -(-self._records // BLOCK))
-        self._pair_counts = device.buffer(4 * self._records)
+        self._sums = device.buffer(_WORD_BYTES * -(-self._records // BLOCK))
+        self._pair_counts = device.buffer(_WORD_BYTES * self._records)
         self._projection = self._stages_of_projection(keys, values)
         self._count_depths = [
             device.bind("cull", "count_depths", page.blocks, *self._page(page), None, self._depths)
@@ -282,7 +295,7 @@ class GpuRenderer:
         visible = pairs = steps = 0
         for rows in self.bands(camera):
             counts = self.draw(camera, rows)
-            pixels = self.device.read(self.pixels, 16 * len(rows) * camera.W).view(np.float32)
+            pixels = self.device.read(self.pixels, _PIXEL_BYTES * len(rows) * camera.W).view(np.float32)
             pixels = pixels.reshape(len(rows), camera.W, 4)
             left = np.abs(pixels[..., 3:])
             rgb[rows.start : rows.stop] = pixels[..., :3] + left * colour
@@ -293,7 +306,7 @@ class GpuRenderer:
     def bands(self, camera: Camera) -> list[range]:
         """Return the rows of an image in bands that fit the buffers, after making room for the pixels of a band."""
         columns = -(-camera.W // _SCREEN_TILE)
-        widest = min(self.device.binding_max // (16 * _SCREEN_TILE), self._pairs_max // BLOCK * _SCREEN_TILE)
+        widest = min(self.device.binding_max // (_PIXEL_BYTES * _SCREEN_TILE), self._pairs_max // BLOCK * _SCREEN_TILE)
         if columns * _SCREEN_TILE > widest:
             raise LimitError("pixels of a row on the GPU", camera.W, widest)
         rows = widest // (columns * _SCREEN_TILE)
@@ -348,6 +361,7 @@ class GpuRenderer:
         return times
 
     def _run(self, stages: list[Stage], times: dict[str, float] | None) -> None:
+        """Run stages; with `times`, wait for them and add the milliseconds of each by name."""
         if times is None:
             self.device.run([call for _, calls in stages for call in calls], clear=[self._ranges])
             return
@@ -355,6 +369,7 @@ class GpuRenderer:
             times[name] = times.get(name, 0.0) + spent
 
     def _view_of(self, camera: Camera, rows: range) -> NDArray[Any]:
+        """Return the `View` of the rows of an image."""
         values = view_vector(camera)
         view = np.zeros((), _VIEW)
         view["rows"][:, :3] = values[:9].reshape(3, 3)
@@ -446,7 +461,7 @@ class GpuRenderer:
                 np.array([8 * digit, of_pairs, digit == 0 and not of_pairs, 0], np.uint32), uniform=True
             )
             a, b = digit % 2, 1 - digit % 2
-            here = self._groups, 12 * groups
+            here = self._groups, _GROUP_COUNT_BYTES * groups
             calls += [
                 device.bind("sort", "count", here, radix, self._counters, keys[a], None, None, None, table),
                 device.bind("sort", "scan", 256, radix, self._counters, keys[a], None, None, None, table),
@@ -474,18 +489,20 @@ class GpuRenderer:
             self._allocate(width, height, pairs)
 
     def _allocate(self, width: int, height: int, pairs: int) -> None:
+        """Set up the buffers and passes of `_make_room`; `pairs` is the room for pairs of splat and screen tile."""
         columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
         device, bind = self.device, self.device.bind
-        self.pixels = device.buffer(16 * width * height)
-        self._ranges = device.buffer(8 * columns * rows)
-        keys, values = ([device.buffer(4 * pairs) for _ in range(2)] for _ in range(2))
+        self.pixels = device.buffer(_PIXEL_BYTES * width * height)
+        self._ranges = device.buffer(_RANGE_BYTES * columns * rows)
+        keys, values = ([device.buffer(_WORD_BYTES * pairs) for _ in range(2)] for _ in range(2))
         bits = max(1, (columns * rows - 1).bit_length())
         done = -(-bits // 8) % 2
         records = self._ellipses, self._looks
         splats = self._view, self._counters, self._order, *records, self._sums, self._pair_counts
-        blocks = self._groups, 12 * _BLOCKS_OF_RANKS
+        blocks = self._groups, _GROUP_COUNT_BYTES * _BLOCKS_OF_RANKS
+        clearing_columns = -(-width * height // (_CLEARED_PIXELS * _CLEARING_ROWS))
         self._clear = [
-            bind("dispatch", "clear_pixels", (-(-width * height // 16384), 64), self._view, None, None, self.pixels)
+            bind("dispatch", "clear_pixels", (clearing_columns, _CLEARING_ROWS), self._view, None, None, self.pixels)
         ]
         bins = [
             bind("bin", "count", blocks, *splats),
@@ -494,7 +511,9 @@ class GpuRenderer:
             bind("bin", "emit", blocks, *splats, keys[0], values[0]),
         ]  # fmt: skip
         sort = self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True)
-        find = bind("ranges", "find", (self._groups, 12 * _SORT_PAIRS), self._counters, keys[done], self._ranges)
+        find = bind(
+            "ranges", "find", (self._groups, _GROUP_COUNT_BYTES * _SORT_PAIRS), self._counters, keys[done], self._ranges
+        )
         blend = bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels)
         following = bind("dispatch", "next_step", 1, None, self._counters)
         self._step = [("bin", bins), ("tile sort", [*sort, find]), ("blend", [blend, following])]

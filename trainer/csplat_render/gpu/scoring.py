@@ -14,6 +14,7 @@ from csplat_render.gpu.renderer import GpuRenderer, GpuScene
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse
 
 _RUN = 4096  # pixels per sum
+_SUM_BYTES = 16  # squared error, the same of covered pixels, their number, and an unused number
 
 
 def compare_scenes(
@@ -51,6 +52,13 @@ def compare_scenes(
 def _compare_view(
     first: GpuRenderer, second: GpuRenderer, camera: Camera, moved: Camera, background: NDArray[np.float32]
 ) -> ViewScore:
+    """Compare the renders of a view, band by band.
+
+    Args:
+        first, second: renderers of the source and of the other scene.
+        camera, moved: the view, relative to the origin of each.
+        background: [3].
+    """
     device, sums = first.device, np.zeros(4)
     second.bands(moved)  # makes room; the bands are the same
     for rows in first.bands(camera):
@@ -61,10 +69,11 @@ def _compare_view(
         backdrop = np.zeros(8, np.float32)
         backdrop[:3] = background
         backdrop.view(np.uint32)[4] = pixels
-        differences = device.buffer(16 * runs)
+        differences = device.buffer(_SUM_BYTES * runs)
         uniform = device.uploaded(backdrop, uniform=True)
         device.run([device.bind("difference", "difference", runs, uniform, first.pixels, second.pixels, differences)])
-        sums += device.read(differences, 16 * runs).view(np.float32).reshape(runs, 4).sum(axis=0, dtype=np.float64)
+        partial = device.read(differences, _SUM_BYTES * runs).view(np.float32).reshape(runs, 4)
+        sums += partial.sum(axis=0, dtype=np.float64)
     count = camera.W * camera.H
     mse, covered = sums[0] / (3 * count), sums[2]
     return ViewScore(

@@ -47,6 +47,12 @@ from csplat_trainer.data.set_folder import SetFolder
 #: Folders with models in numbered subfolders, or with a model; the last folder is used only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
 _IMAGE_FOLDERS = ("images", "input", ".")
+# Bytes of the smallest records of binary models, and of the elements of their lists.
+_CAMERA_SIZE_MIN = 24  # id, model, width, height
+_IMAGE_SIZE_MIN = 73  # id, pose, camera, end of the name, number of keypoints
+_KEYPOINT_SIZE = 24  # position, point
+_POINT_SIZE_MIN = 51  # id, position, colour, error, length of the track
+_TRACK_ELEMENT_SIZE = 8  # image, keypoint
 _UNDISTORTED_FIRST = "distorted"  # by convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
 
 
@@ -330,7 +336,7 @@ def read_cameras(path: Path, used: Collection[int] | None = None, report: list[s
             cameras[number] = _lens(words[1].upper(), numbers[0], numbers[1], numbers[2:], where)
         return cameras
     data = _BinaryFile(path)
-    for _ in range(data.count(24)):
+    for _ in range(data.read_count(_CAMERA_SIZE_MIN)):
         number, model, width, height = data.unpack("<iiQQ")
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"of number {model}"
         # Other models are refused below, so their number of parameters does not matter.
@@ -364,11 +370,11 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
             entries.append((words[9].rstrip(), _integer(words[8], where), _numbers(words[1:8], where), where))
     else:
         data = _BinaryFile(path)
-        for _ in range(data.count(73)):
+        for _ in range(data.read_count(_IMAGE_SIZE_MIN)):
             number, *pose, camera = data.unpack("<i7di")
             name = data.string()
-            (matches,) = data.unpack("<Q")
-            data.skip(24 * matches)
+            (keypoint_count,) = data.unpack("<Q")
+            data.skip(_KEYPOINT_SIZE * keypoint_count)
             entries.append((name, camera, pose, f"{path}, image {number}"))
         data.end()
     finite = [entry for entry in entries if np.isfinite(entry[2]).all()]
@@ -387,7 +393,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
 
 def count_images(path: Path) -> int:
     """Count the images of images.bin or images.txt."""
-    return len(_image_lines(path)[0]) if path.suffix == ".txt" else _BinaryFile(path).count(73)
+    return len(_image_lines(path)[0]) if path.suffix == ".txt" else _BinaryFile(path).read_count(_IMAGE_SIZE_MIN)
 
 
 def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
@@ -411,9 +417,9 @@ def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
             points.append(tuple(_numbers(words[1:7], where)))
     else:
         data = _BinaryFile(path)
-        for _ in range(data.count(51)):
-            _, x, y, z, red, green, blue, _, track = data.unpack("<Q3d3BdQ")
-            data.skip(8 * track)
+        for _ in range(data.read_count(_POINT_SIZE_MIN)):
+            _, x, y, z, red, green, blue, _, track_length = data.unpack("<Q3d3BdQ")
+            data.skip(_TRACK_ELEMENT_SIZE * track_length)
             points.append((x, y, z, red, green, blue))
         data.end()
     table = np.array(points, np.float64).reshape(-1, 6)
@@ -441,10 +447,17 @@ class _BinaryFile:
         self._at += size
         return values
 
-    def count(self, smallest: int) -> int:
-        """Return the number of records that follow, each of at least `smallest` bytes."""
+    def read_count(self, least_size: int) -> int:
+        """Read the number of records that follow.
+
+        Args:
+            least_size: bytes that every record has at least.
+
+        Raises:
+            InputError: the file is too short for this number of records.
+        """
         count = int(self.unpack("<Q")[0])
-        self._need(count * smallest)
+        self._need(count * least_size)
         return count
 
     def string(self) -> str:

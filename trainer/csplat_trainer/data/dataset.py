@@ -205,7 +205,11 @@ def _list_files(folder: Path, role: str) -> list[Path]:
 
 
 def _names_in(line: str, known: Container[str]) -> list[str]:
-    """Return the names in a line of a list: the line, or its parts between commas, without quotes and comments."""
+    """Return the names in a line of a list: its parts between commas, without quotes.
+
+    A line that is one of the `known` names, as it is or normalised, is a single name even if it has commas, quotes or a
+    leading `#`. Every other line with a leading `#` is a comment, and has no names.
+    """
     line = line.strip()
     if line in known or normalise_name(line) in known:
         return [line]

@@ -35,6 +35,7 @@ _VERSION = 2
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # properties of a node
+_NUMBER_MAX = 1e300  # products of larger numbers could exceed float64
 _MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference a mesh very often
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
 _INSTANCING = "EXT_mesh_gpu_instancing"
@@ -189,6 +190,7 @@ class GltfDocument:
         return buffer[start : start + length], self.integer(record, json_path, "byteStride", 0)
 
     def _buffer(self, index: int) -> memoryview:
+        """Return a buffer, at most `byteLength` bytes; a buffer with fewer bytes is noted in `short`."""
         if index not in self._buffers:
             record, json_path = self.item("buffers", index), ("buffers", index)
             uri, length = self.get(record, json_path, "uri", str), self.integer(record, json_path, "byteLength")
@@ -204,6 +206,7 @@ class GltfDocument:
         return self._buffers[index]
 
     def _read_uri(self, uri: str, json_path: JsonPath) -> memoryview:
+        """Return the bytes of a base64 data URI, or of a file in the folder of the document."""
         if uri.startswith("data:"):
             kind, _, text = uri.partition(",")
             if not kind.endswith(";base64"):
@@ -314,6 +317,7 @@ class GltfDocument:
         return values
 
     def _transform(self, node: dict[str, Any], json_path: JsonPath) -> F64:
+        """Return the matrix [4, 4] of a node, from its `matrix` or its rotation, scale and translation."""
         if "matrix" in node:
             return self._numbers(node, json_path, "matrix", np.eye(4).ravel()).reshape(4, 4).T
         matrix = np.eye(4)
@@ -324,6 +328,7 @@ class GltfDocument:
         return matrix
 
     def _rotation(self, quat: list[float], json_path: JsonPath) -> list[list[float]]:
+        """Return the rotation matrix, [3, 3], of a quaternion x y z w of any finite length above 0."""
         length = math.hypot(*quat)
         if not 0.0 < length < math.inf:
             raise self.error(json_path, f"found {quat}, expected a unit quaternion")
@@ -335,9 +340,10 @@ class GltfDocument:
         ]
 
     def _numbers(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: Any) -> F64:
+        """Return a list of numbers, float64, as many as the default has."""
         values = holder.get(key, list(default))
         good = isinstance(values, list) and len(values) == len(default)
-        if not good or not all(type(value) in (int, float) and abs(value) < 1e300 for value in values):
+        if not good or not all(type(value) in (int, float) and abs(value) < _NUMBER_MAX for value in values):
             raise self.error((*json_path, key), f"found {_shorten(values)}, expected {len(default)} numbers")
         return np.array(values, np.float64)
 

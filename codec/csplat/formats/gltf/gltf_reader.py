@@ -174,6 +174,11 @@ class _GltfReading:
                 raise self.file.error((*json_path, key), f"found {value!r}, expected {expected}")
 
     def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
+        """Check a primitive with plain accessors.
+
+        Returns:
+            A function that decodes rows; the number of rows; and the numbers of rows that `_survey` returns.
+        """
         file, json_path = self.file, (*placed.json_path, "attributes")
         attributes = file.get(placed.primitive, placed.json_path, "attributes", dict, {})
 
@@ -225,6 +230,7 @@ class _GltfReading:
         return bad, infinite
 
     def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
+        """Count the rows with huge scales or coefficients; `good` [n] masks those of `rows` to look at, `None`: all."""
         kept = slice(None) if good is None else good
         scales = log_scales(arrays["SCALE"].values(rows)[kept])
         return count_huge_rows(
@@ -234,6 +240,16 @@ class _GltfReading:
     def _packed_block(
         self, placed: PlacedPrimitive, view: int, *, draft: bool
     ) -> tuple[Callable[[slice], SplatModel], int]:
+        """Read a primitive whose splats are an SPZ in a buffer view, which is unpacked once.
+
+        Args:
+            placed: the primitive.
+            view: index of the buffer view.
+            draft: the extension is a draft, whose positions may be stored along other axes.
+
+        Returns:
+            A function that decodes rows, and the number of rows.
+        """
         file = self.file
         if view not in self.packed:
             data, _ = file.view(view)
@@ -436,6 +452,7 @@ def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> S
 
 
 def _read_comments(file: GltfDocument) -> CommentMetadata:
+    """Read the metadata that our writer adds to the asset; the licence is also read from its copyright."""
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):

@@ -90,6 +90,14 @@ def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
 def _build_json(
     scene: Scene, attributes: dict[str, NDArray[Any]], offsets: list[int], bounds: tuple[F64, F64]
 ) -> dict[str, Any]:
+    """Return the JSON of a file with a single mesh.
+
+    Args:
+        scene: the scene.
+        attributes: columns of all splats by name, POSITION first; only shapes and types are used.
+        offsets: offsets of the columns in the buffer, and its size, bytes.
+        bounds: least and largest position, [3] each.
+    """
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
     lines = format_comments(scene.metadata, scene.origin, absolute=False)
     if scene.metadata.licence is not None:

@@ -75,6 +75,7 @@ class _ZipDirectory:
             return archive.read(info)
 
     def _open_archive(self) -> zipfile.ZipFile:
+        """Open the zip; raise an `InputError` with a reason if it is damaged."""
         try:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
@@ -164,12 +165,14 @@ class SogParts:
         return path
 
     def _inside(self, name: str) -> PurePosixPath:
+        """Return the path of a part; refuse names that are long, absolute or lead out of the folder."""
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
             self.refuse(f"the part {name[:80]!r} would be outside of it")
         return path
 
     def _unzip(self, name: str, most: int) -> bytes:
+        """Return a part in a zip of at most `most` bytes; refuse absent, ambiguous, damaged and too large parts."""
         assert self.zip is not None, "`folder` is only set within a zip"
         matches = self.zip.find(name)
         if not matches:

@@ -29,6 +29,7 @@ from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, I64, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
+_CODES = 256  # codes of a byte of an image
 _KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # a meta.json of another program has none of these
 _Range = tuple[int, int, int]  # file index, first splat, end
 
@@ -66,6 +67,15 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
 
 
 def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: int | None) -> Scene:
+    """Open a SOG, or a level of streamed SOG.
+
+    Args:
+        path: path of the file or folder, for messages.
+        parts: its parts.
+        name: name of the JSON.
+        level: level of streamed SOG; 0 for others.
+        max_splats: see `_open_streamed`.
+    """
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(key in meta for key in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
@@ -89,6 +99,7 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: 
 
 
 def _list_findings(images: SogImages) -> list[Finding]:
+    """Return a finding about rotations without a valid tag, if there are any."""
     if not images.zeros:
         return []
     text = f"{counted(images.zeros, 'rotation')} without a valid component tag: set to the identity"
@@ -284,13 +295,14 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
         bounds=_read_bounds(meta["means"]),
         scales=_interpolate(meta["scales"], 3) if old else np.repeat(_read_codebook(meta["scales"])[None], 3, 0),
         sh0=sh0[:3],
-        alpha=alpha_of_logits(sh0[3]) if old else (np.arange(256) / 255.0).astype(np.float32),
+        alpha=alpha_of_logits(sh0[3]) if old else (np.arange(_CODES) / (_CODES - 1.0)).astype(np.float32),
         shN=shN,
         palette=palette,
     )
 
 
 def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
+    """Return the bounds of the means, [2, 3], logarithmic; refuse bounds that exceed float32."""
     bounds = np.stack(_read_ends(means, 3))
     if np.abs(bounds).max() > _LARGEST_LOG:
         means.parts.refuse(f"the bounds of {means.json_path} exceed float32")
@@ -298,6 +310,7 @@ def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
 
 
 def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `mins` and `maxs` of a section, [channels] each; refuse crossed ones."""
     low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
     for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
         reason = f"mins {low[channel]:.6g}, expected at most maxs {high[channel]:.6g}"
@@ -306,18 +319,20 @@ def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], 
 
 
 def _interpolate(section: JsonValue, channels: int) -> F32:
+    """Return the values by code, [channels, 256], evenly spaced between `mins` and `maxs`."""
     low, high = (ends[:, None] for ends in _read_ends(section, channels))
-    return (low + (high - low) * (np.arange(256) / 255.0)).astype(np.float32)
+    return (low + (high - low) * (np.arange(_CODES) / (_CODES - 1.0))).astype(np.float32)
 
 
 def _read_codebook(section: JsonValue) -> F32:
+    """Return the values by code, [256]; NaN beyond the end of a shorter codebook."""
     values = section["codebook"].value
-    if isinstance(values, list) and len(values) == 256 and values[0] is None:
+    if isinstance(values, list) and len(values) == _CODES and values[0] is None:
         # Early writers omitted the first entry; it is extrapolated as in PlayCanvas' engine.
-        after = JsonValue(section.parts, section.json_path, values[1:]).numbers(255, 255)
-        section.value["codebook"] = [float(after[0] + (after[0] - after[-1]) / 255), *values[1:]]
-    codebook = np.full(256, np.nan, np.float32)
-    numbers = section["codebook"].numbers(1, 256)
+        after = JsonValue(section.parts, section.json_path, values[1:]).numbers(_CODES - 1, _CODES - 1)
+        section.value["codebook"] = [float(after[0] + (after[0] - after[-1]) / (_CODES - 1)), *values[1:]]
+    codebook = np.full(_CODES, np.nan, np.float32)
+    numbers = section["codebook"].numbers(1, _CODES)
     codebook[: len(numbers)] = numbers
     return codebook
 
@@ -393,6 +408,7 @@ class SogImages:
             yield self._block(slice(start, start + BLOCK_SPLATS), missing)
 
     def _block(self, part: slice, missing: int) -> dict[str, Any]:
+        """Decode the splats `part` to the arrays of a model, with zeros for `missing` coefficients per channel."""
         sog, codes = self.sog, self.quats[part]
         three = (codes[:, :3].astype(np.float32) / np.float32(255) * 2 - 1) * np.float32(0.5**0.5)
         quats = decode_smallest_three(codes[:, 3] & 3, three)
@@ -426,6 +442,7 @@ def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
 
 
 def _list_files(section: JsonValue, count: int) -> list[str]:
+    """Return the names of the images of a section; refuse another number of names than `count`."""
     names = [item.text() for item in section["files"].list()]
     if len(names) != count or len(set(names)) != count:
         section.parts.refuse(f"{section.json_path} files has {len(set(names))} names, expected {count}")
@@ -433,6 +450,8 @@ def _list_files(section: JsonValue, count: int) -> list[str]:
 
 
 def _read_palette(sog: SogMeta, name: str, data: bytes) -> F32:
+    """Return the SH coefficients of a palette image, [entries, K, 3]; refuse unexpected sizes and codes."""
+
     def fits(width: int, height: int) -> bool:
         degrees = [sog.degree] if sog.degree is not None else [1, 2, 3]
         rows = 1 if sog.palette is None else -(-sog.palette // ENTRIES)

@@ -260,6 +260,7 @@ def _build_palette(scene: Scene, sample: SplatModel, weights_of: Callable[[Splat
 
 
 def _encode_webp(pixels: U8) -> bytes:
+    """Return a lossless WebP of pixels [H, W, 4]; raise an `InputError` if Pillow is not installed."""
     try:
         from PIL import Image
     except ModuleNotFoundError as error:

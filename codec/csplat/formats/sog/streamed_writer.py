@@ -168,6 +168,7 @@ def _number_leaves(tree: _Cut | int, means: F32) -> I64:
 
 
 def _survey(scene: Scene, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
+    """Measure the leaves of the tree at a level, and distribute them among chunks; reads all blocks."""
     counts = np.zeros(leaf_count, np.int64)
     centres, extents = (
         np.stack([np.full((leaf_count, 3), limit) for limit in (np.inf, -np.inf)], axis=1) for _ in "ce"
@@ -213,6 +214,7 @@ def _list_runs(
 def _write_chunks(
     folders: Sequence[Path], scene: Scene, tree: _Cut | int, statistics: _LevelStatistics, losses: SogLosses
 ) -> None:
+    """Write a SOG into each folder: the splats of a chunk, sorted by leaf, then along a Z curve through the leaf."""
     low, high = statistics.centres[:, 0], statistics.centres[:, 1]
     scales = np.divide(2**_CELL_BITS - 1, high - low, out=np.zeros_like(low), where=high > low)
 
