@@ -104,7 +104,8 @@ def finish(model: SplatModel) -> SplatModel:
     """Remove invisible splats and add metadata."""
     shown = np.flatnonzero(model.opacities >= _FAINT)
     facts = {"licence": "CC0-1.0", "comments": list(COMMENTS)}
-    return replace(model.select(shown), coordinate_system="RDF", metadata=facts)
+    metadata = replace(model.metadata, coordinate_system="RDF", entries=facts)
+    return model.select(shown).with_metadata(metadata)
 
 
 def photograph_all(folder: Path, recipe: Recipe) -> tuple[F32, F32]:
