@@ -139,6 +139,7 @@ def _decode(data: bytes, limits: Limits | None, context: Context) -> tuple[dict[
 
 
 def _has_levels(data: bytes) -> bool:
+    """Return True if a file has coarser levels; False if its header cannot be read."""
     from csplat import decoder
 
     try:

@@ -185,12 +185,20 @@ def run_command(
 
 
 def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:
+    """Return the vectors whose name matches `options.pattern` and of which a clause matches `options.clause`.
+
+    Raises:
+        InputError: a pattern matches no name or no clause.
+    """
     vectors = load()
     names = select_names(options.pattern, [vector.name for vector in vectors], "vector")
+    selected = [vector for vector in vectors if vector.name in names]
+    if options.clause is None:
+        return selected  # including vectors without a clause
     clauses = select_names(
         options.clause, {clause for vector in vectors for clause in vector.clauses}, "clause of a vector"
     )
-    return [vector for vector in vectors if vector.name in names and clauses & {*vector.clauses}]
+    return [vector for vector in selected if clauses & {*vector.clauses}]
 
 
 def _make_report(

@@ -9,7 +9,7 @@ from tables import failures
 
 from csplat.errors import InputError
 from csplat_render.camera import intrinsics, look_at, orbit
-from csplat_render.camera_paths import orbit_cameras
+from csplat_render.camera_paths import _best_arc, orbit_cameras
 from csplat_render.scene_frame import scene_frame
 from csplat_render.virtual_cameras import virtual_cameras
 
@@ -51,6 +51,18 @@ def test_a_path_in_surroundings_stays_in_front_of_walls_and_is_closed():
     assert np.ptp(places, axis=0).max() > 0.3 * extent
     steps = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)  # including from the last to the first
     assert steps.max() < 0.4 * extent
+
+
+def test_the_best_arc_is_the_cyclic_run_with_the_largest_sum():
+    cases = (
+        ([[-1, 2, 3, -1], [-1, 4, -9, 0]], (0, 1, 2)),
+        ([[3, -1, -1, 2], [1, 1, 1, 1]], (0, 3, 2)),  # across the end of a row
+        ([[1, 0, -5, 0], [0, 2, 2, 2]], (1, 1, 3)),
+        ([[1, 1, 1, 1]], (0, 0, 4)),
+        ([[-3, -1, -2, -2]], (0, 1, 1)),
+        ([[0, 1, 0, 1]], (0, 1, 3)),
+    )
+    assert [arc for _, arc in cases] == [_best_arc(np.array(gains, np.float64)) for gains, _ in cases]
 
 
 def ring(count, spread=360.0):

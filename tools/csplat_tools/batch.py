@@ -181,7 +181,7 @@ def run_batch(
     if page.exists() and not force and _MARK.encode() not in read_bytes(page):
         return replace(done, has_page=False)
     target.mkdir(parents=True, exist_ok=True)
-    write_bytes(str(page), make_page(done).encode())
+    write_bytes(str(page), make_batch_page(done).encode())
     return done
 
 
@@ -456,24 +456,29 @@ def _local(place: str, folder: Path) -> Iterator[Path]:
             files.put_file(str(local), path)
 
 
-def make_page(batch: Batch) -> str:
+def make_batch_page(batch: Batch) -> str:
     """Return the HTML report: totals, failed scenes, and a table of the others."""
     done, failed = batch.select("done", "done_before"), batch.select("failed")
-    source, output = (sum(getattr(result, name) or 0 for result in done) for name in ("source_bytes", "output_bytes"))
+    source_bytes = sum(result.source_bytes or 0 for result in done)
+    output_bytes = sum(result.output_bytes or 0 for result in done)
     totals = {
         "command": " ".join(("csplat", *batch.command)),
         "done": f"{len(done):,} of {len(batch.results):,}",
-        "bytes": f"{format_bytes(source)} -> {format_bytes(output)}",
+        "bytes": f"{format_bytes(source_bytes)} -> {format_bytes(output_bytes)}",
     }
     heads = [html.Head("scene", kind="name"), *map(html.Head, ("splats", "source, kB", "output, kB", "seconds"))]
     rows = []
     for result in done:
         values = result.splats, (result.source_bytes or 0) / 1e3, (result.output_bytes or 0) / 1e3, result.seconds
-        texts = ("" if value is None else f"{value:,.1f}".removesuffix(".0") for value in values)
-        rows.append([(result.output, result.path), *zip(texts, values, strict=True)])
+        rows.append([(result.output, result.path), *((_cell_text(value), value) for value in values)])
     errors = (
         html.table(("scene", "error"), [(result.path, result.error) for result in failed], words=(1,)) if failed else ""
     )
     table = html.sortable_table(heads, rows) if rows else ""
     parts = [_MARK, html.definitions(totals), html.section("Failed", errors), html.section("Done", table)]
     return html.document(f"{batch.folder.resolve().name}: {len(batch.results):,} scenes", parts)
+
+
+def _cell_text(value: float | None) -> str:
+    """Return a number with at most one decimal; nothing if it is unknown."""
+    return "" if value is None else f"{value:,.1f}".removesuffix(".0")

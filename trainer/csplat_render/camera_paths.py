@@ -3,7 +3,7 @@
 An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), at a distance that shows all of
 it. In *surroundings*, a circle would lead through walls. If cameras are known, the path follows their positions and
 directions. If the scene specifies an initial view, the path sways around it. Otherwise the path goes back and forth
-along the longest of several arcs on which fine splats are visible.
+along the arc with the greatest surplus of visible detail.
 
 These cameras are not used for scoring; `psnr` uses `virtual_cameras.virtual_cameras`.
 """
@@ -36,9 +36,10 @@ _TURNS = 24  # number of azimuths to try
 _HEIGHTS = np.linspace(-0.2, 0.2, 5)  # heights of look-at points to try, relative to the object's middle and height
 
 _ARC_POINTS = 12_000  # cloud points for surroundings
+_ARC_SIZE = (640, 480)  # pixels of the images whose detail is compared
 _ARC_ELEVATIONS = (5.0, 20.0, 40.0)  # degrees
 _ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
-_GOOD = 0.85  # detail on an arc, as a fraction of the best view's detail
+_GOOD = 0.85  # detail from which a view is worth showing, as a fraction of the best view's detail
 _ARC_MIN = 10.0  # degrees in each direction
 
 _SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees in each direction from a known view; the widest is tried first
@@ -192,32 +193,44 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 
 
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
-    """Return the longest good arc inside surroundings: azimuths back and forth [count], elevation, distance."""
-    K = intrinsics(640, 480, FIELD_OF_VIEW)
+    """Return a path inside surroundings, on the arc with the greatest surplus of detail.
+
+    The surplus is the sum over azimuths of the detail minus `_GOOD` times that of the best view. The path swings along
+    the arc and back, or goes round if the arc is a full circle.
+
+    Returns:
+        [count] azimuths, degrees; elevation, degrees; distance from the centre, extents.
+    """
+    K = intrinsics(*_ARC_SIZE, FIELD_OF_VIEW)
     azimuths = np.arange(_TURNS) * 360.0 / _TURNS
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
     details = np.array(
         [
-            [detail(cloud, frame.camera_at(a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
+            [detail(cloud, frame.camera_at(a, *circle, K, *_ARC_SIZE), HIDING * frame.extent) for a in azimuths]
             for circle in circles
         ]
     )
-    gains = details - _GOOD * details.max()
-    best = (-math.inf, 0, 0, 1)
-    for number, gain in enumerate(gains):
-        sums = np.concatenate([[0.0], np.cumsum(np.tile(gain, 2))])
-        for length in range(1, _TURNS + 1):
-            totals = sums[length : length + _TURNS] - sums[:_TURNS]
-            start = int(np.argmax(totals))
-            if totals[start] > best[0] + 1e-12:
-                best = float(totals[start]), number, start, length
-    _, number, start, length = best
+    number, start, length = _best_arc(details - _GOOD * details.max())
     turns = np.arange(count) / count
     if length == _TURNS:
         return 360.0 * turns, *circles[number]
     step = 360.0 / _TURNS
     half = max(0.5 * (length - 1) * step, _ARC_MIN)
     return (start + 0.5 * (length - 1)) * step + half * np.sin(2.0 * np.pi * turns), *circles[number]
+
+
+def _best_arc(gains: F64) -> tuple[int, int, int]:
+    """Return row, first column and length of the run with the largest sum, at least one long; rows are cyclic."""
+    turns = gains.shape[1]
+    most, best = -math.inf, (0, 0, 1)
+    for row, gain in enumerate(gains):
+        sums = np.concatenate([[0.0], np.cumsum(np.tile(gain, 2))])
+        for length in range(1, turns + 1):
+            totals = sums[length : length + turns] - sums[:turns]
+            start = int(np.argmax(totals))
+            if totals[start] > most + 1e-12:  # more than rounding; of equal runs, the first row's shortest is kept
+                most, best = float(totals[start]), (row, start, length)
+    return best
 
 
 def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:

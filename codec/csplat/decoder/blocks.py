@@ -208,8 +208,13 @@ def work_dtype(bound: int) -> np.dtype[np.signedinteger]:
     return np.dtype(np.int32) if bound < 1 << 31 else np.dtype(np.int64)
 
 
-def runs(count: int, columns: int) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of runs of splats whose integers fit the cache."""
+def cache_sized_ranges(count: int, columns: int) -> Iterator[tuple[int, int]]:
+    """Yield (start, stop) of consecutive ranges of splats whose integers fit the second-level cache.
+
+    Args:
+        count: number of splats.
+        columns: number of integers per splat.
+    """
     step = min(_RUN_SPLATS, max(1, _RUN_ELEMENTS // columns))
     for start in range(0, count, step):
         yield start, min(count, start + step)
@@ -337,7 +342,7 @@ def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
 def morton_axes(codes: Ints) -> Ints:
     """Return [3, n] uint32 of codes [n]: "Bit 3·b + a of a code is bit b of the integer q of axis a"."""
     out = np.empty((3, len(codes)), np.uint32)
-    for start, stop in runs(len(codes), 3):
+    for start, stop in cache_sized_ranges(len(codes), 3):
         wide = codes[start:stop].astype(np.uint64)
         shifted = np.empty_like(wide)
         for axis in range(3):

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Block, CodebookBlock, ColumnBlock, SparseBlock, TileBlocks, runs, work_dtype
+from csplat.decoder.blocks import (
+    Block,
+    CodebookBlock,
+    ColumnBlock,
+    SparseBlock,
+    TileBlocks,
+    cache_sized_ranges,
+    work_dtype,
+)
 from csplat.decoder.container import SceneHeader, Tile, refuse_field
 from csplat.decoder.entropy import Ints
 from csplat.errors import FormatError
@@ -144,7 +152,7 @@ def write_integers(
         array = out[name]
         exponents[attribute - 1] = block.exponent
         if attribute == _spec.ATTRIBUTE_OPACITIES:
-            for start, stop in runs(count, 1):
+            for start, stop in cache_sized_ranges(count, 1):
                 array[start:stop] = block.rows(start, stop, _INT32)[0]
         elif attribute == _spec.ATTRIBUTE_QUATS:
             for start, stop, q, _r in quat_rows(block, record, count):
@@ -213,7 +221,7 @@ def lattice_rows(
     dtype = work_dtype(bound)
     step = math.ldexp(record.step, block.exponent)
     check = record.attribute != _spec.ATTRIBUTE_MEANS and not _is_finite(bound, step)
-    for start, stop in runs(count, columns):
+    for start, stop in cache_sized_ranges(count, columns):
         rows = block.rows(start, stop, dtype)
         third = columns // 3
         parts = rows[:third], rows[third : 2 * third], rows[2 * third :]
@@ -353,7 +361,7 @@ def opacity_table(record: _spec.AttributeRecord) -> F32:
 
 def write_opacities(block: Block, table: F32, out: F32) -> None:
     """Write opacities, [n], by a table of all levels, which LEV-1 has bounded."""
-    for start, stop in runs(len(out), 1):
+    for start, stop in cache_sized_ranges(len(out), 1):
         levels = block.rows(start, stop, _INT32)[0]
         np.take(table, levels, out=out[start:stop], mode="clip")
 
@@ -366,7 +374,7 @@ def quat_rows(
     Raises:
         FormatError: E_RANGE by QUA-2: R is negative.
     """
-    for start, stop in runs(count, 3):
+    for start, stop in cache_sized_ranges(count, 3):
         q = block.rows(start, stop, _INT32).astype(np.float64)
         square = q[0] * q[0]
         r = 2.0 * record.levels * record.levels - square

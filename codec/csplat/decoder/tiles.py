@@ -16,6 +16,7 @@ from csplat.decoder.blocks import (
     Indices,
     SparseBlock,
     TileBlocks,
+    cache_sized_ranges,
     check_integers,
     check_step,
     morton_axes,
@@ -24,7 +25,6 @@ from csplat.decoder.blocks import (
     read_exponent,
     read_offsets,
     read_signed,
-    runs,
 )
 from csplat.decoder.codebooks import attribute_columns
 from csplat.decoder.container import TILE_FLAGS, Cursor, SceneHeader, Tile, check_reserved, open_chunk, refuse_field
@@ -256,25 +256,25 @@ def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
 
 
 def _indices(
-    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, params: _spec.CodebookParams, at: int
+    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, params: _spec.CodebookParams, params_at: int
 ) -> Indices:
     """Read the indices, or return the indices of the codebook's first block in the tile (CBK-4)."""
     if holds_indices(book.record, attribute):
-        indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
+        indices = _read_indices(cursor, context, attribute, book, params.escape_count, params_at)
         context.first[params.codebook_id] = indices
         return indices
     known = context.first.get(params.codebook_id)
     if known is None or len(known.escaped) != params.escape_count:
         detail = f"{_spec.ATTRIBUTE_NAMES[attribute]} disagrees with the codebook's first block in the escape count"
         wanted = "a first block" if known is None else len(known.escaped)
-        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-4", detail, found=params.escape_count, wanted=wanted)
+        raise FormatError(_spec.ERROR_CODEBOOK, params_at, "CBK-4", detail, found=params.escape_count, wanted=wanted)
     return known
 
 
 def _read_indices(
-    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, at: int
+    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, params_at: int
 ) -> Indices:
-    """Read the entry index of each splat, and check CBK-2 and CBK-3.
+    """Read the entry index of each splat.
 
     Args:
         cursor: at the stream of indices.
@@ -282,19 +282,25 @@ def _read_indices(
         attribute: registry value.
         book: the codebook.
         escape_count: number of escapes by the parameters of the block.
-        at: offset of these parameters.
+        params_at: offset of these parameters.
+
+    Raises:
+        FormatError: E_CODEBOOK by CBK-2 or CBK-3; or the stream of indices is invalid.
     """
     count = context.tile.splat_count
-    size, stream_at = book.record.size, cursor.at
+    escape_index, stream_at = book.record.size, cursor.at  # the index after the last entry's marks an escape
     entry_indices = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
     largest = int(entry_indices.max())
-    if largest > size:
-        wanted = f"at most {size}"
+    if largest > escape_index:
+        wanted = f"at most {escape_index}"
         raise FormatError(_spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=wanted)
-    escaped = np.flatnonzero(entry_indices == size)
+    escaped = np.flatnonzero(entry_indices == escape_index)
     if len(escaped) != escape_count:
-        at += _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"]
-        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-3", "escape_count", found=escape_count, wanted=len(escaped))
+        field_at = params_at + _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"]
+        wanted_count = len(escaped)
+        raise FormatError(
+            _spec.ERROR_CODEBOOK, field_at, "CBK-3", "escape_count", found=escape_count, wanted=wanted_count
+        )
     return Indices(book, attribute, entry_indices, escaped)
 
 
@@ -313,7 +319,7 @@ def _check_sums(block: CodebookBlock, context: TileContext) -> None:
     if block.bound <= _spec.COLUMN_MAX:
         return
     record = context.header.attribute(_spec.ATTRIBUTE_SCALES)
-    for start, stop in runs(context.tile.splat_count, 3):
+    for start, stop in cache_sized_ranges(context.tile.splat_count, 3):
         rows = block.rows(start, stop, _WIDE)
         lows = tuple(int(value) for value in rows.min(axis=1))
         highs = tuple(int(value) for value in rows.max(axis=1))

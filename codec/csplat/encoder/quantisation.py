@@ -21,6 +21,8 @@ Floats = NDArray[Any]
 Integers = NDArray[Any]
 
 _WIDE = _spec.COLUMN_MAX / 2  # maximum integer of scales and colours; half of LAT-4's bound, to allow for rounding
+#: Magnitude below which the nearest multiple of a step is finite in float32, since it is at most twice the value.
+_SAFE32 = 1e38
 _EXACT32 = 2.0**20  # steps from which colours are quantised in float64
 _ROWS = 2048  # splats per block; rows of 45 floats and their columns fit the second-level cache
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # spec 7.5
@@ -59,8 +61,9 @@ def quantise_means(means: F32, step: float) -> I64:
     scaled = means.astype(np.float64)
     scaled /= step
     n = np.rint(scaled, out=scaled).astype(np.int64)
-    if float(np.abs(means).max(initial=0.0)) > 1e38:
+    if float(np.abs(means).max(initial=0.0)) > _SAFE32:
         with np.errstate(over="ignore"):
+            # One step suffices: a nearest multiple beyond float32 exceeds the mean by at most half a step.
             n -= np.where(np.isinf(lattice_values(n, step)), np.sign(n), 0)
     return n
 

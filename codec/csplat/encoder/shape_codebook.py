@@ -158,7 +158,7 @@ def choose_shapes(
     codebook: ShapeCodebook | None = None
     for step in range(_ROUNDS):
         context.progress("shapes", step / _ROUNDS)
-        entries, index = _cluster(shapes, training, size, parameters, steps)
+        entries, index = _train_entries(shapes, training, size, parameters, steps)
         errors, summand = _assignment_errors(shapes, entries, index, parameters)
         if fraction is None:
             assigned = _worth_assigning(shapes, errors, index, summand)
@@ -341,15 +341,25 @@ def _points(covariances: F64) -> I16:
     return np.rint(_vectors(covariances) * _TRACE_STEPS).astype(np.int16)
 
 
-def _cluster(
+def _train_entries(
     shapes: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, context: Context
 ) -> tuple[I32, I64]:
-    """Train entries [6, K] on the file's lattices, and return them with the entry of each splat, [N]."""
+    """Train entries on the file's lattices.
+
+    Args:
+        shapes: the shapes of all splats.
+        weights: [N], weights in the training; 0 for splats outside of it.
+        size: number of entries; fewer result if some are unused or equal.
+        parameters: steps and codings.
+        context: threads, seed and progress.
+
+    Returns:
+        [6, K] entries; [N] index of each splat's entry, whether or not it is in the training.
+    """
     points = _points(shapes.covariances)
     _, start = cluster(points, weights.astype(np.float32), size, context=context)
-    entries = _centroids(shapes, weights, start.astype(np.int64), parameters)
-    index = _assign(shapes, points, entries, parameters, context)
-    for _ in range(1, 1 if shapes.metric is None else _METRIC_ROUNDS):
+    entries, index = np.zeros((6, 0), np.int32), start.astype(np.int64)
+    for _ in range(1 if shapes.metric is None else _METRIC_ROUNDS):
         entries = _centroids(shapes, weights, index, parameters)
         index = _assign(shapes, points, entries, parameters, context)
     return entries, index

@@ -544,11 +544,15 @@ class _ZCurve:
         return replace(curve, splits=np.union1d(_SHELL_CODES, codes[np.arange(1, blocks) * len(codes) // blocks]))
 
     def codes(self, means: F32) -> I64:
-        """Return the Morton codes of positions [N, 3]."""
+        """Return the codes of positions [N, 3] along the curve, [N].
+
+        A code is the shell's number (0: the cube around the middle), then 3 * `_STEP_BITS` bits of Morton code within
+        the shell's cube.
+        """
         places = (means - self.middle) / (_CORE * self.spread)  # the cube around the middle is -1 to 1
-        reach = np.abs(places).max(axis=1, initial=1.0)
-        shells = np.minimum(np.ceil(np.log(reach) / np.log(_SHELL_RATIO)), len(_SHELL_CODES))
-        places /= _SHELL_RATIO ** shells[:, None]
+        radii = np.abs(places).max(axis=1, initial=1.0)  # at least 1, so that the cube is shell 0
+        shells = np.minimum(np.ceil(np.log(radii) / np.log(_SHELL_RATIO)), len(_SHELL_CODES))
+        places /= _SHELL_RATIO ** shells[:, None]  # the shell's cube is -1 to 1
         cells = np.clip((places + 1.0) * 2.0 ** (_STEP_BITS - 1), 0, 2**_STEP_BITS - 1).astype(np.int64)
         codes: I64 = shells.astype(np.int64) << 3 * _STEP_BITS | morton_codes(cells.T)
         return codes

@@ -490,11 +490,15 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
 def _check_entries(
     log: ViolationLog, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
 ) -> bool:
-    """Check CBK-7 for all entries, [K, columns]. Scales are checked in the tile, with their summand."""
+    """Check the entries of one layer, [size, columns], by CBK-7, and return True if they are valid.
+
+    Scales are skipped: the tile checks them with their summand (CBK-6).
+    """
     sound = True
     for attribute in attributes:
-        columns = attribute_columns(book, attribute)
-        if columns is None or attribute == _spec.ATTRIBUTE_SCALES:
+        if attribute == _spec.ATTRIBUTE_SCALES:
             continue
-        sound &= check_integers(log, index, attribute, table[:, columns].T, 0, where)
+        columns = attribute_columns(book, attribute)
+        assert columns is not None, "the codebook contains its own attributes"
+        sound &= check_integers(log, index, attribute, table[:, columns].T, exponent=0, where=where)
     return sound

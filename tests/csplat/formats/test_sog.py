@@ -209,7 +209,7 @@ def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
         (scene | again, r"2 scenes, expected one \(a/meta.json, b/meta.json\): unpack it"),
         (again | files, r"2 scenes, .*b/meta.json, lod-meta"),
         (nested, r"0_0/meta.json, lod-meta.json"),
-        (within, r"0_0.sog is a zip within a zip: unpack a.zip"),
+        (within, r"0_0.sog is not a .json; a SOG within a zip cannot be a zip itself: unpack a.zip"),
         ({"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}, "2 scenes"),
         (scene | {"scene.ply": b"ply"}, r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"),
         (foreign, not_sog + r"a zip that contains room\.ply: unzip it"),

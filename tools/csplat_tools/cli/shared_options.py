@@ -229,10 +229,15 @@ def take_estimated_up(
         return None
     word = up_word(axis)
     output.remark(
-        f"the scene does not specify its up direction; {word} is estimated"
+        _estimate_text(word)
         + (", and used (encode --up writes it into a file)" if shown else f": --up {word} writes it")
     )
     return axis
+
+
+def _estimate_text(word: str) -> str:
+    """Return the clause of remarks about an estimated up direction, in the form of `up_word`."""
+    return f"the scene does not specify its up direction; {word} is estimated"
 
 
 def open_data(path: str, **options: Any) -> DataOptions:
@@ -295,6 +300,13 @@ class ViewOptions:
             model: the scene.
             output: prints remarks.
             count, size, validation_count, split, every: as for `find_view_set`.
+
+        Returns:
+            The views by role; virtual views if there is neither a camera file nor a data set.
+
+        Raises:
+            InputError: the given views are not valid, or too few.
+            OSError: a file cannot be read.
         """
         view_set = find_view_set(
             model, cameras=self.cameras, data=self.data_options, background=self.colour, count=count, size=size,
@@ -305,8 +317,8 @@ class ViewOptions:
         if axis is not None:
             word = up_word(axis)
             output.remark(
-                f"views are placed for -y up, since the scene does not specify its up direction; {word} is estimated:"
-                f" `csplat convert IN.ply OUT.ply --up {word}` writes it, and changes views and PSNR"
+                f"views are placed for -y up, since {_estimate_text(word)}: "
+                f"`csplat convert IN.ply OUT.ply --up {word}` writes it, and changes views and PSNR"
             )
         return view_set
 

@@ -67,7 +67,9 @@ from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 
-_RENDERS = (520.0, 2480.0)  # cost of a target in renders of a test view: a fixed part, and one of pruning by effort
+# Cost of meeting a target, in renders of one test view.
+_SEARCH_RENDERS = 520.0  # search of an encoding; does not depend on the effort
+_PRUNING_RENDERS = 2480.0  # pruning at the default effort
 
 # Typical values; pairs are without and with SH.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
@@ -726,10 +728,10 @@ def search_target(
 
 
 def expected_renders(encoding: EncodeOptions, target: Target) -> float:
-    """Return the approximate cost of a target in renders of the test views."""
+    """Return the approximate cost of meeting a target, in renders of one test view."""
     if _keeps_all(target, encoding):
-        return _RENDERS[0]
-    return _RENDERS[0] + _RENDERS[1] * SimplifyOptions(effort=target.effort).work
+        return _SEARCH_RENDERS
+    return _SEARCH_RENDERS + _PRUNING_RENDERS * SimplifyOptions(effort=target.effort).work
 
 
 def _keeps_all(target: Target, encoding: EncodeOptions) -> bool:

@@ -315,22 +315,24 @@ def _images(shown: Sequence[ShownView]) -> str:
 def _training_plot(training: Mapping[str, Any] | None) -> str:
     if training is None or len(training["entries"]) < 2:
         return ""
-    entries, tests = training["entries"], training["evaluations"]
+    entries, evaluations = training["entries"], training["evaluations"]
 
     def draw(canvas: Figure) -> None:
-        axes = canvas.add_subplot()
+        """Plot PSNR of training and test images, and the number of splats, by step."""
+        psnr_axes = canvas.add_subplot()
         steps = [entry["iteration"] for entry in entries]
-        axes.plot(steps, [entry["psnr"] for entry in entries], color=_LINE, label="training images")
-        if tests:
-            at, psnrs = [evaluation["iteration"] for evaluation in tests], [evaluation["psnr"] for evaluation in tests]
-            axes.plot(at, psnrs, "o", color=_OTHER, label="test images")
-        axes.set(xlabel="step", ylabel="PSNR, dB")
-        axes.legend(loc="lower right")
-        right = axes.twinx()
-        right.plot(steps, [entry["splat_count"] for entry in entries], ":", color=INK)
-        right.set_ylabel("splats (dotted)")
-        right.set_ylim(bottom=0)
-        right.grid(visible=False)
+        psnr_axes.plot(steps, [entry["psnr"] for entry in entries], color=_LINE, label="training images")
+        if evaluations:
+            test_steps = [evaluation["iteration"] for evaluation in evaluations]
+            test_psnrs = [evaluation["psnr"] for evaluation in evaluations]
+            psnr_axes.plot(test_steps, test_psnrs, "o", color=_OTHER, label="test images")
+        psnr_axes.set(xlabel="step", ylabel="PSNR, dB")
+        psnr_axes.legend(loc="lower right")
+        count_axes = psnr_axes.twinx()
+        count_axes.plot(steps, [entry["splat_count"] for entry in entries], ":", color=INK)
+        count_axes.set_ylabel("splats (dotted)")
+        count_axes.set_ylim(bottom=0)
+        count_axes.grid(visible=False)
 
     small = training["options"]["half_size"]
     note = html.paragraph(f"The first {small:.0%} of the steps used images of half the size.") if small else ""
@@ -343,14 +345,15 @@ def _tuning_plot(file: Mapping[str, Any] | None) -> str:
         return ""
 
     def draw(canvas: Figure) -> None:
-        axes = canvas.add_subplot()
+        """Plot PSNR of validation views, and the size of the file, by step."""
+        psnr_axes = canvas.add_subplot()
         steps = [validation["iteration"] for validation in validations]
-        axes.plot(steps, [validation["psnr"] for validation in validations], "o-", color=_LINE, markersize=3)
-        axes.set(xlabel="step", ylabel="PSNR on validation views, dB")
-        right = axes.twinx()
-        right.plot(steps, [validation["size_bytes"] / 1e6 for validation in validations], ":", color=INK)
-        right.set_ylabel("MB of the file (dotted)")
-        right.grid(visible=False)
+        psnr_axes.plot(steps, [validation["psnr"] for validation in validations], "o-", color=_LINE, markersize=3)
+        psnr_axes.set(xlabel="step", ylabel="PSNR on validation views, dB")
+        size_axes = psnr_axes.twinx()
+        size_axes.plot(steps, [validation["size_bytes"] / 1e6 for validation in validations], ":", color=INK)
+        size_axes.set_ylabel("MB of the file (dotted)")
+        size_axes.grid(visible=False)
 
     text = "Values are optimised through the encoder's quantisers; the step with the best loss was kept."
     plot = html.figure(draw_svg(draw, (_WIDE, _HIGH), "tuning"))

@@ -330,7 +330,7 @@ def read_cameras(path: Path, used: Collection[int] | None = None, report: list[s
             number = _integer(words[0], where)
             if used is not None and number not in used:
                 continue
-            numbers = _numbers(words[2:], where)
+            numbers = _parse_numbers(words[2:], where)
             if len(numbers) < 2:
                 raise InputError(f"{where}: expected id, model, width, height, parameters")
             cameras[number] = _lens(words[1].upper(), numbers[0], numbers[1], numbers[2:], where)
@@ -367,7 +367,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
             words = line.split(None, 9)
             if len(words) < 10:
                 raise InputError(f"{where}: expected id, rotation, translation, camera and name")
-            entries.append((words[9].rstrip(), _integer(words[8], where), _numbers(words[1:8], where), where))
+            entries.append((words[9].rstrip(), _integer(words[8], where), _parse_numbers(words[1:8], where), where))
     else:
         data = _BinaryFile(path)
         for _ in range(data.read_count(_IMAGE_SIZE_MIN)):
@@ -414,7 +414,7 @@ def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
         for words, where in rows:
             if len(words) < 7:
                 raise InputError(f"{where}: expected id, position and colour")
-            points.append(tuple(_numbers(words[1:7], where)))
+            points.append(tuple(_parse_numbers(words[1:7], where)))
     else:
         data = _BinaryFile(path)
         for _ in range(data.read_count(_POINT_SIZE_MIN)):
@@ -549,8 +549,12 @@ def _is_pose(line: str) -> bool:
     return len(words) == 10 and words[0].isdecimal() and words[8].isdecimal()
 
 
-def _numbers(words: list[str], where: str) -> list[float]:
-    """Parse numbers, as `_parse_number` does."""
+def _parse_numbers(words: list[str], where: str) -> list[float]:
+    """Parse words as numbers, each as `_parse_number` does.
+
+    Raises:
+        InputError: a word, printed with its place `where`, is not a number.
+    """
     values = []
     for word in words:
         try:

@@ -166,7 +166,7 @@ def _shots(
     for frame in frames:
         if frame.name in image_files.files:
             image, where = image_files.files[frame.name], f"{path}, frame {frame.number}"
-            lens = _lens(frame_values(document, frame.values), image, where)
+            lens = _read_lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
             shots.append(Shot(_plain(frame.name, image, place.path), image, lens, viewmat, masks.get(frame.name)))
     report += describe_scales(
@@ -320,34 +320,55 @@ def _load(place: SetFolder, path: Path) -> dict[str, Any]:
     return document
 
 
-def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
-    """Return the lens: focal lengths or angles of view, for the given or the file's size; and the distortion."""
+def _read_lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
+    """Read the intrinsics and distortion of a frame; the size is that of the image file if w or h is missing.
+
+    Args:
+        values: values of the frame, and those of the document that it does not override.
+        image: the frame's image file.
+        where: the frame's place, for messages.
+
+    Raises:
+        InputError: a value is missing or invalid, or the camera model or one of its coefficients is not supported.
+    """
     model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
-    if not fisheye and model.upper() not in PERSPECTIVES:
-        remedy = f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
-        raise InputError(
-            f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
-            f"{SPLIT_PANORAMAS if is_panorama(model) else remedy}"
-        )
-    if "w" in values and "h" in values:
-        width, height = finite_number(values, "w", where), finite_number(values, "h", where)
-    else:
-        width, height = (float(side) for side in image_size(image))
-    if not (width >= 1.0 and height >= 1.0):
-        raise InputError(f"{where}: w and h are {width:g} and {height:g}, expected at least 1")
+    if not fisheye:
+        _check_perspective(model, where)
+    width, height = _read_size(values, image, where)
     fx, fy = focal_lengths(values, width, height, where, fisheye=fisheye)
     cx, cy = finite_number(values, "cx", where, width / 2.0), finite_number(values, "cy", where, height / 2.0)
     k1, k2, k3, k4, k5, k6 = (finite_number(values, f"k{i}", where, 0.0) for i in range(1, 7))
     p1, p2 = finite_number(values, "p1", where, 0.0), finite_number(values, "p2", where, 0.0)
     # OpenCV's rational model divides by k4 to k6, other programs multiply; only the model's name distinguishes them.
     unsupported = {"k5": k5, "k6": k6} | ({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
-    strange = [f"{key} is {value:g}" for key, value in unsupported.items() if value != 0.0]
-    if strange and (fisheye or model.upper() != _RATIONAL):
+    nonzero_unsupported = [f"{key} is {value:g}" for key, value in unsupported.items() if value != 0.0]
+    if nonzero_unsupported and (fisheye or model.upper() != _RATIONAL):
         raise InputError(
-            f"{where}: {strange[0]} with camera_model {model or 'not named'}, expected 0: k4 to k6 belong to "
-            f"{_RATIONAL}, k1 to k4 to OPENCV_FISHEYE; or use {UNDISTORTER}"
+            f"{where}: {nonzero_unsupported[0]} with camera_model {model or 'not named'}, expected 0: k4 to k6 belong "
+            f"to {_RATIONAL}, k1 to k4 to OPENCV_FISHEYE; or use {UNDISTORTER}"
         )
     if fisheye:
         return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3, k4), projection="equidistant", source=where)
     return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3), (p1, p2), (k4, k5, k6), source=where)
+
+
+def _check_perspective(model: str, where: str) -> None:
+    """Refuse a camera model that is not a supported perspective model."""
+    if model.upper() not in PERSPECTIVES:
+        remedy = f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
+        raise InputError(
+            f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
+            f"{SPLIT_PANORAMAS if is_panorama(model) else remedy}"
+        )
+
+
+def _read_size(values: Mapping[str, Any], image: Path, where: str) -> tuple[float, float]:
+    """Read width and height in pixels, from the image file if w or h is missing."""
+    if "w" in values and "h" in values:
+        width, height = finite_number(values, "w", where), finite_number(values, "h", where)
+    else:
+        width, height = (float(side) for side in image_size(image))
+    if not (width >= 1.0 and height >= 1.0):
+        raise InputError(f"{where}: w and h are {width:g} and {height:g}, expected at least 1")
+    return width, height

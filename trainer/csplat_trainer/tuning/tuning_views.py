@@ -93,14 +93,14 @@ def split_views(views: Sequence[TuningView], background: F32, validation_count: 
     """Split views into training and validation views.
 
     A scene fits its training images better than others. If some of them were held out, their scores would fall with
-    every step, whatever is gained on others. So by default all are training views, and some of them are validation
-    views, too.
+    every step, whatever is gained on others. So by default all views are training views, and up to `_MAX_VALIDATION` of
+    them are validation views, too.
 
     Args:
         views: the views, in the order of capture.
         background: [3], their background.
-        validation_count: number of validation views to hold out, for images that the scene was not trained on, or
-            renders; 0: none.
+        validation_count: number of views to hold out for validation, if the scene was not trained on them; 0: hold
+            out none.
 
     Raises:
         InputError: `validation_count` leaves no training view.
@@ -108,9 +108,10 @@ def split_views(views: Sequence[TuningView], background: F32, validation_count: 
     if validation_count >= len(views):
         raise InputError(f"{validation_count} of {len(views)} views for validation leave none for training")
     count = validation_count or min(len(views), _MAX_VALIDATION)
-    validation = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
-    training = [view for number, view in enumerate(views) if not validation_count or number not in validation]
-    return TuningViews(training, [views[number] for number in sorted(validation)], background)
+    # The views in the middle of `count` equal parts of the sequence; they are distinct, since count <= len(views).
+    validation_numbers = {(2 * part + 1) * len(views) // (2 * count) for part in range(count)}
+    training = [view for number, view in enumerate(views) if not validation_count or number not in validation_numbers]
+    return TuningViews(training, [views[number] for number in sorted(validation_numbers)], background)
 
 
 def renders_of(

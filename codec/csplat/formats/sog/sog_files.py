@@ -23,6 +23,7 @@ from csplat.lint import Finding
 _LARGEST_JSON = 1 << 25  # bytes
 _LARGEST_PART = 1 << 30  # bytes
 _LONGEST_NAME = 200  # characters
+_SHOWN = 80  # characters of a name in messages
 _ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of a single scene, and of a scene in levels
 _OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
 _NAMED = 5  # maximum number of scenes that a message lists
@@ -118,19 +119,27 @@ class SogParts:
         with nullcontext() if self.zip is None else self.zip.kept_open():
             yield
 
-    def inner(self, name: str) -> tuple[SogParts, str]:
-        """Return the parts of a nested SOG and the name of its JSON, as `find_parts` does.
+    def nested(self, name: str) -> tuple[SogParts, str]:
+        """Return the parts of a nested SOG and the name of its JSON.
+
+        Args:
+            name: path of the SOG, relative to the folder of this one; within a zip it must be the path of a JSON.
 
         Raises:
-            InputError: it does not exist, or its name leads out of the folder.
-            OSError: it cannot be read.
+            InputError: the name leads out of the folder; in a folder, there is no SOG of this name; in a zip, it is not
+                the name of a JSON. A JSON that is missing from a zip is reported when it is read.
+            OSError: the SOG cannot be read.
         """
-        title = f"{self.title}: {name[:80]}"
+        shown = name[:_SHOWN]
+        title = f"{self.title}: {shown}"
         if self.folder is None:
             return find_parts(self.file(name), title)
         path = self._inside(name)
         if path.suffix.lower() != ".json":
-            self.refuse(f"{name[:80]} is a zip within a zip: unpack {self.title} and name its {_LEVELS}")
+            self.refuse(
+                f"{shown} is not a .json; a SOG within a zip cannot be a zip itself: unpack {self.title} and name its "
+                f"{_LEVELS}"
+            )
         return SogParts(self.path, title, self.folder / path.parent, self.zip), path.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
@@ -146,9 +155,9 @@ class SogParts:
             with open_binary(self.file(name)) as stream:
                 data = stream.read(most + 1)
             if len(data) > most:
-                self.refuse(f"{name[:80]} has more than {most:,} bytes")
+                self.refuse(f"{name[:_SHOWN]} has more than {most:,} bytes")
         if instead := describe_substitute(data[:64]):
-            self.refuse(f"{name[:80]} is {instead}")
+            self.refuse(f"{name[:_SHOWN]} is {instead}")
         return data
 
     def file(self, name: str) -> Path:
@@ -157,18 +166,18 @@ class SogParts:
         try:
             path = path_inside(self.path, str(inside))
             if path is not None and (self.folder is not None or not path.is_file()):
-                self.refuse(f"there is no {name[:80]}")
+                self.refuse(f"there is no {name[:_SHOWN]}")
         except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: circular links
-            self.refuse(f"{name[:80]!r} cannot be read: {error}")
+            self.refuse(f"{name[:_SHOWN]!r} cannot be read: {error}")
         if path is None:
-            self.refuse(f"the part {name[:80]!r} is a link that leads out of it: copy the file there")
+            self.refuse(f"the part {name[:_SHOWN]!r} is a link that leads out of it: copy the file there")
         return path
 
     def _inside(self, name: str) -> PurePosixPath:
         """Return the path of a part; refuse names that are long, absolute or lead out of the folder."""
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
-            self.refuse(f"the part {name[:80]!r} would be outside of it")
+            self.refuse(f"the part {name[:_SHOWN]!r} would be outside of it")
         return path
 
     def _unzip(self, name: str, most: int) -> bytes:
@@ -176,16 +185,16 @@ class SogParts:
         assert self.zip is not None, "`folder` is only set within a zip"
         matches = self.zip.find(name)
         if not matches:
-            self.refuse(f"there is no {name[:80]}")
+            self.refuse(f"there is no {name[:_SHOWN]}")
         if len({info.filename for info in matches}) > 1:
-            self.refuse(f"{' and '.join(info.filename[:80] for info in matches[:2])} would both be {name[:80]}")
+            self.refuse(f"{' and '.join(info.filename[:_SHOWN] for info in matches[:2])} would both be {name[:_SHOWN]}")
         info = matches[-1]
         if reason := member_refusal(info, min(most, _FREE + _EXPANSION * info.compress_size)):
-            self.refuse(f"{name[:80]} {reason}")
+            self.refuse(f"{name[:_SHOWN]} {reason}")
         try:
             return self.zip.read(info)
         except DAMAGED as error:
-            self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
+            self.refuse(f"{name[:_SHOWN]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
 
     def json(self, name: str) -> JsonValue:
         """Read and parse a JSON part."""
@@ -193,7 +202,7 @@ class SogParts:
         try:
             value = parse_json(data)
         except InputError as error:
-            self.refuse(f"{name[:80]} is not JSON: {error}")
+            self.refuse(f"{name[:_SHOWN]} is not JSON: {error}")
         return JsonValue(self, name, value)
 
     def refuse(self, reason: str) -> NoReturn:
@@ -326,7 +335,7 @@ def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoRetur
 
 
 def _list_paths(paths: Sequence[PurePosixPath]) -> str:
-    return ", ".join(str(path)[:80] for path in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
+    return ", ".join(str(path)[:_SHOWN] for path in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
 
 
 def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:

@@ -61,7 +61,7 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
         ranges = sorted((*_range_at(leaf, level), number) for number, leaf in enumerate(leaves))
         around = 0
         if "environment" in meta:
-            around = read_meta(*parts.inner(use_slashes(meta["environment"].text()))).count
+            around = read_meta(*parts.nested(use_slashes(meta["environment"].text()))).count
     numbers = [np.full(stop - start, number, np.int64) for _, start, stop, number in ranges]
     return np.concatenate([*numbers, np.full(around, len(leaves), np.int64)])
 
@@ -116,7 +116,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
     if level > last:
         parts.refuse(f"the level is {level}, expected 0 to {last}")
     environment = use_slashes(meta["environment"].text()) if "environment" in meta else None
-    around = 0 if environment is None else read_meta(*parts.inner(environment)).count
+    around = 0 if environment is None else read_meta(*parts.nested(environment)).count
     counts = [
         around + sum(stop - start for _, start, stop in (_range_at(leaf, lod) for leaf in leaves))
         for lod in range(last + 1)
@@ -132,7 +132,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
         ranges[environment] = None
     metas: list[tuple[SogMeta, list[tuple[int, int]]]] = []
     for name, file_ranges in ranges.items():
-        sog = read_meta(*parts.inner(name))
+        sog = read_meta(*parts.nested(name))
         taken = [(0, sog.count)] if file_ranges is None else file_ranges
         if taken[-1][1] > sog.count:
             parts.refuse(f"the level uses splats up to {taken[-1][1]:,} of {name}, which has {sog.count:,}")
