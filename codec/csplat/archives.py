@@ -159,7 +159,7 @@ def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
     if not zipfile.is_zipfile(stream):
         raise InputError("it is not a .npz file")
     arrays: dict[str, NDArray[Any]] = {}
-    left = unpacked_limit(stream.seek(0, 2))
+    remaining_bytes = unpacked_limit(stream.seek(0, io.SEEK_END))
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if len(members) > _MAX_ARRAYS:
@@ -168,9 +168,9 @@ def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
             name = info.filename.removesuffix(".npy")
             if name in arrays:
                 raise InputError(f"it has two arrays {name[:80]}")
-            if reason := member_refusal(info, left):
+            if reason := member_refusal(info, remaining_bytes):
                 raise InputError(f"its {name[:80]} {reason}")
-            left -= info.file_size
+            remaining_bytes -= info.file_size
             with archive.open(info) as member:
                 try:
                     arrays[name] = parse_array(cast(io.BufferedIOBase, member), info.file_size)

@@ -108,9 +108,11 @@ class Store:
         """Release the file."""
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Read the bytes of each range (start, stop); a part that is too short is reported by `read`."""
         raise NotImplementedError
 
     def _is_other(self) -> bool:
+        """Return True if the file has changed since it was opened."""
         return False
 
 
@@ -207,6 +209,7 @@ class FileWindow:
         self._here = [(0, len(self._head))]
 
     def _read_ranges(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """Read ranges (start, stop) into the view, and mark them as present."""
         if not ranges:
             return
         for (start, stop), data in zip(ranges, self.store.read(ranges), strict=True):

@@ -132,6 +132,7 @@ def refusal(path: Path, head: bytes, *, wanted: str = "", shown: str = "") -> In
 
 
 def _starts_with(*magics: bytes) -> Callable[[Path, bytes], bool]:
+    """Return a test for files that start with one of some byte strings."""
     return lambda _path, head: head.startswith(magics)
 
 
@@ -156,6 +157,7 @@ def _declares(word: bytes) -> Callable[[Path, bytes], bool]:
 
 
 def _is_spz(_path: Path, head: bytes) -> bool:
+    """Return True for the magic number of SPZ, plain (version 4) or at the start of gzip data (1 to 3)."""
     if head[:2] == b"\x1f\x8b":
         try:
             head = zlib.decompressobj(wbits=31).decompress(head, 4)
@@ -165,14 +167,17 @@ def _is_spz(_path: Path, head: bytes) -> bool:
 
 
 def _is_gzip(path: Path, head: bytes) -> bool:
+    """Return True for a gzip file under another name than .spz, for which the SPZ reader reports the damage."""
     return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # the SPZ reader reports the damage
 
 
 def _is_ksplat(_path: Path, head: bytes) -> bool:
+    """Return True if a file begins with version 0.1 and `head` is zeros after the fields of the header."""
     return head[:4] == b"\0\1\0\0" and len(head) > _KSPLAT_HEAD and not any(head[_KSPLAT_HEAD:])
 
 
 def _is_sog(path: Path, head: bytes) -> bool:
+    """Return True for a folder, zip or JSON with a manifest of SOG; a damaged zip counts if it is named .sog."""
     if path.is_dir():
         return any((path / name).is_file() for name in _MANIFESTS)
     if head[:4] == b"PK\x03\x04":
@@ -193,6 +198,7 @@ def _zip_with(ending: str) -> Callable[[Path, bytes], bool]:
 
 
 def _names_in_zip(path: Path) -> list[str] | None:
+    """Return the names of the members of a zip; `None` if it is damaged or cannot be read."""
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.namelist()
@@ -201,10 +207,12 @@ def _names_in_zip(path: Path) -> list[str] | None:
 
 
 def _is_gltf(path: Path, head: bytes) -> bool:
+    """Return True for .glb by its magic number, and for JSON that is named .gltf or has an "asset"."""
     return head[:4] == b"glTF" or (_is_json(path, head) and (path.suffix.lower() == ".gltf" or b'"asset"' in head))
 
 
 def _is_tileset(path: Path, head: bytes) -> bool:
+    """Return True for a JSON of 3D Tiles, by its name or by "geometricError"."""
     return _is_json(path, head) and (path.name.lower() == "tileset.json" or b'"geometricError"' in head)
 
 
@@ -225,12 +233,14 @@ def _is_lcc(path: Path, head: bytes) -> bool:
 
 
 def _is_lcc2(path: Path, head: bytes) -> bool:
+    """Return True for a folder with an .lcc2, or for JSON by that suffix or by "splatType"."""
     if path.is_dir():
         return _holds(path, ".lcc2")
     return _is_json(path, head) and (path.suffix.lower() == ".lcc2" or b'"splatType"' in head)
 
 
 def _holds(folder: Path, suffix: str) -> bool:
+    """Return True if a folder contains a file with a suffix; False if it cannot be listed."""
     try:
         return any(entry.suffix.lower() == suffix for entry in folder.iterdir())
     except OSError:
@@ -238,10 +248,12 @@ def _holds(folder: Path, suffix: str) -> bool:
 
 
 def _is_safetensors(_path: Path, head: bytes) -> bool:
+    """Return True for a plausible length of the head, 8 bytes, and the start of its JSON."""
     return head[8:10] == b'{"' and 0 < int.from_bytes(head[:8], "little") < _SAFETENSORS_HEAD
 
 
 def _is_usd(path: Path, head: bytes) -> bool:
+    """Return True for USD in binary or text, or a zip with a layer of USD."""
     return head.startswith((b"PXR-USDC", b"#usda")) or _zip_with(".usdc")(path, head) or _zip_with(".usda")(path, head)
 
 

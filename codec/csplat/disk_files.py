@@ -145,6 +145,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _parse_integer(digits: str) -> int:
+    """Parse an integer of JSON; raise a `ValueError` if it has more than `_INTEGER_DIGITS` digits."""
     if len(digits) > _INTEGER_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits, expected at most {_INTEGER_DIGITS}")
     return int(digits)
@@ -217,7 +218,11 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
 
 
 def _parts(file: Any, name: str) -> Iterator[memoryview]:
-    """Yield the bytes of a binary file or buffer in pieces; errors of reading get its name."""
+    """Yield the bytes of a binary file or buffer in pieces; an `OSError` gets its name.
+
+    Raises:
+        InputError: `file` is neither, or its text does not decode.
+    """
     try:
         if isinstance(file, mmap) or not hasattr(file, "read"):
             yield memoryview(file).cast("B")
@@ -230,6 +235,7 @@ def _parts(file: Any, name: str) -> Iterator[memoryview]:
 
 
 def _read_part(file: Any, name: str) -> Any:
+    """Read at most `_PART_SIZE` bytes; an `OSError` gets the name of the file."""
     with named_errors(name):
         return file.read(_PART_SIZE)
 

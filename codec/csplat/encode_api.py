@@ -197,6 +197,11 @@ def _encode_model(
     levels: LevelBuilder | None,
     context: Context,
 ) -> EncodeResult:
+    """Encode a model in memory, with or without a target; arguments as in `encode_with_report`.
+
+    A rendered target is met by the installed search. Error bounds are met without levels first. If that took a
+    search, the scene is encoded again with levels and the options that it found; otherwise it has no levels.
+    """
     if target is None:
         return encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
     if target.is_rendered:
@@ -228,6 +233,7 @@ def encode_planned(
 
 
 def _builder_of(levels: Levels, count: int, options: EncodeOptions) -> LevelBuilder | None:
+    """Return a builder as it is, `None` for no levels, or the builder for a number or name of levels."""
     if levels is None or not isinstance(levels, int | str):
         return levels
     builder: LevelBuilder | None = _plugin("csplat.levels", "builder", "builder of levels of detail")(
@@ -237,6 +243,7 @@ def _builder_of(levels: Levels, count: int, options: EncodeOptions) -> LevelBuil
 
 
 def _plugin(group: str, name: str, what: str) -> Any:
+    """Load an entry point of a group; raise an `InputError` that names the feature `what` if it is absent."""
     plugin = load_plugins(group).get(name)
     if plugin is None:
         raise InputError(f"no {what} is installed (entry points of {group}): pip install 'csplat[render]'")

@@ -51,14 +51,14 @@ class FormatError(CsplatError):
         found: object = None,
         wanted: object = None,
     ) -> None:
-        super().__init__(code, offset, clause, _join(detail, found, wanted))
+        super().__init__(code, offset, clause, _join_detail(detail, found, wanted))
         self.code = code
         self.offset = offset
         self.clause = clause
-        self.detail = _join(detail, found, wanted)
+        self.detail = _join_detail(detail, found, wanted)
 
     def __str__(self) -> str:
-        return _sentence(self.code, self.offset, self.clause, self.detail)
+        return _format_error(self.code, self.offset, self.clause, self.detail)
 
 
 class UnsupportedError(CsplatError):
@@ -79,7 +79,7 @@ class UnsupportedError(CsplatError):
         self.clause = clause
 
     def __str__(self) -> str:
-        return _sentence(self.code, self.offset, self.clause, f"{self.feature} is not supported")
+        return _format_error(self.code, self.offset, self.clause, f"{self.feature} is not supported")
 
 
 class LimitError(CsplatError):
@@ -113,7 +113,7 @@ class LimitError(CsplatError):
 
     def __str__(self) -> str:
         allowed = "" if self.allowed is None else f", allowed {self.allowed}"
-        return _sentence(self.code, self.offset, self.clause, f"{self.limit}: needs {self.wanted}{allowed}")
+        return _format_error(self.code, self.offset, self.clause, f"{self.limit}: needs {self.wanted}{allowed}")
 
 
 class InputError(CsplatError):
@@ -164,7 +164,8 @@ def missing_package(error: ModuleNotFoundError, package: str | None = None, *, e
     return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 
 
-def _join(detail: str, found: object, wanted: object) -> str:
+def _join_detail(detail: str, found: object, wanted: object) -> str:
+    """Join the parts of a message, "detail, found X, expected Y", leaving out what is empty or `None`."""
     parts = [detail] if detail else []
     if found is not None:
         parts.append(f"found {found}")
@@ -173,7 +174,8 @@ def _join(detail: str, found: object, wanted: object) -> str:
     return ", ".join(parts)
 
 
-def _sentence(code: str, offset: int | None, clause: str, detail: str) -> str:
+def _format_error(code: str, offset: int | None, clause: str, detail: str) -> str:
+    """Return "CODE at byte N (CLAUSE): detail", leaving out what is unknown."""
     where = "" if offset is None else f" at byte {offset}"
     by = f" ({clause})" if clause else ""
     return f"{code}{where}{by}: {detail}" if detail else f"{code}{where}{by}"

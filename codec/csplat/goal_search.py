@@ -50,14 +50,18 @@ def next_value(
     is_near = math.isfinite(met) and met >= goal - tolerance
     if is_near or (tries is not None and len(measured) >= tries):
         return None
-    expected, aim, (low, high) = _function(model), max(goal - margin, 0.5 * (met + goal)), bounds
+    expected = _as_function(model)
+    aim = max(goal - margin, 0.5 * (met + goal))
+    low, high = bounds
     if measured:
-        first, second, is_bracket = _pair(goal, measured, least_step)
-        (value, result), factor = first, 1.0
+        first, second, is_bracket = _choose_pairs(goal, measured, least_step)
+        value, result = first
+        factor = 1.0
         low, high = max(low, value - largest_step), min(high, value + largest_step)
         if second is not None:
             other, its_result = second
-            change, edge = expected(other) - expected(value), max(_EDGE * abs(other - value), least_step)
+            change = expected(other) - expected(value)
+            edge = max(_EDGE * abs(other - value), least_step)
             factor = (its_result - result) / change if change else 1.0
             if is_bracket and factor > 0.0:
                 low, high = max(low, min(value, other) + edge), min(high, max(value, other) - edge)
@@ -74,11 +78,12 @@ def next_value(
     return proposed if bounds[0] <= proposed <= bounds[1] else None
 
 
-def _function(model: float | Callable[[float], float]) -> Callable[[float], float]:
+def _as_function(model: float | Callable[[float], float]) -> Callable[[float], float]:
+    """Return the model as a function; a number is the slope of a line through the origin."""
     return model if callable(model) else lambda value: model * value
 
 
-def _pair(
+def _choose_pairs(
     goal: float, measured: Sequence[tuple[float, float]], least_step: float
 ) -> tuple[tuple[float, float], tuple[float, float] | None, bool]:
     """Return the two pairs that determine the model, the nearest to the goal first, and True if they enclose the goal.
@@ -86,7 +91,8 @@ def _pair(
     Of all such pairs, their values are the nearest to each other.
     """
     by_result = sorted(measured, key=lambda pair: abs(pair[1] - goal))
-    met, missed = ([pair for pair in by_result if (pair[1] <= goal) == is_met] for is_met in (True, False))
+    met = [pair for pair in by_result if pair[1] <= goal]
+    missed = [pair for pair in by_result if not pair[1] <= goal]  # a NaN misses
     if met and missed:
         ends = min(itertools.product(met, missed), key=lambda pairs: abs(pairs[0][0] - pairs[1][0]))
         first, second = sorted(ends, key=lambda pair: abs(pair[1] - goal))

@@ -128,23 +128,24 @@ def open_image(
             Pillow is not installed.
     """
     name = name or ("image" if isinstance(source, bytes) else os.fspath(source))
-    with _stream(source, name) as stream:
+    with _open_stream(source, name) as stream:
         head, size_bytes = stream.read(_HEAD_SIZE), stream.seek(0, os.SEEK_END)
         stream.seek(0)
-        kind = _identify(head, name, formats)
+        kind = _identify_format(head, name, formats)
         if size_bytes > _FILE_MAX:
             raise InputError(f"{name} has {size_bytes:,} bytes, expected at most {_FILE_MAX:,}")
         with _pillow, warnings.catch_warnings(), _silent_libtiff(kind):
             warnings.simplefilter("ignore")
             logging.getLogger("PIL").addHandler(_SILENT)
             image = _open(stream, kind, name)
-            with _converted_errors(kind, name), image:
+            with _reported_errors(kind, name), image:
                 if budget:
                     _check_budget(image.size, size_bytes, name)
                 yield image
 
 
-def _stream(source: str | os.PathLike[str] | bytes, name: str) -> BinaryIO:
+def _open_stream(source: str | os.PathLike[str] | bytes, name: str) -> BinaryIO:
+    """Open a path or bytes for reading; raise an `InputError` with `name` if that fails."""
     if isinstance(source, bytes):
         return io.BytesIO(source)
     try:
@@ -175,14 +176,18 @@ def _silent_libtiff(kind: ImageFormat) -> Iterator[None]:
         os.close(saved)
 
 
-def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFormat:
-    """Return the format of a file by its first bytes; refuse other formats by name."""
-    expected = ", ".join(formats[:-1]) + " or " * (len(formats) > 1) + formats[-1]
+def _identify_format(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFormat:
+    """Return the format of a file by its first bytes.
+
+    Raises:
+        InputError: the format is not among `formats`, which the message names if it is a known one.
+    """
+    expected = ", ".join(formats[:-1]) + (" or " if len(formats) > 1 else "") + formats[-1]
     kind: ImageFormat | None = next((kind for magic, kind in _MAGICS if head.startswith(magic)), None)
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":  # between them, the size of the file
         kind = "WebP"
     suffix = Path(name).suffix.lower()
-    if suffix in _RAW_SUFFIXES or (kind == "TIFF" and head[8:10] == b"CR"):
+    if suffix in _RAW_SUFFIXES or (kind == "TIFF" and head[8:10] == b"CR"):  # CR2 of Canon
         raise _raw_refusal(name)
     if kind is not None and kind in formats:
         return kind
@@ -203,12 +208,17 @@ def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFo
 
 
 def _open(stream: BinaryIO, kind: ImageFormat, name: str) -> ImageFile:
+    """Open an image with Pillow's class for its format; only its header is read.
+
+    Raises:
+        InputError: Pillow is not installed, or the file is damaged or a camera's raw file.
+    """
     module, title = _PLUGINS[kind]
     try:
         opener = getattr(import_module(module), title)
     except ModuleNotFoundError as error:
         raise missing_package(error, "Pillow") from None
-    with _converted_errors(kind, name):
+    with _reported_errors(kind, name):
         image: ImageFile = opener(stream, name)
         tags = getattr(image, "tag_v2", {})
         if _DNG_VERSION in tags or tags.get(_SUBFILE, 0) & 1:
@@ -217,12 +227,13 @@ def _open(stream: BinaryIO, kind: ImageFormat, name: str) -> ImageFile:
 
 
 def _raw_refusal(name: str) -> InputError:
+    """Return the error for a camera's raw file."""
     return InputError(f"{name} is {_RAW}, expected an image: develop it to PNG or JPEG")
 
 
 @contextmanager
-def _converted_errors(kind: ImageFormat, name: str) -> Iterator[None]:
-    """Turn the errors of Pillow into a single line; its plugins raise almost any error on damaged files."""
+def _reported_errors(kind: ImageFormat, name: str) -> Iterator[None]:
+    """Raise any error of Pillow as an `InputError` of one line: its plugins raise almost any error on damaged files."""
     try:
         yield
     except CsplatError:
@@ -244,6 +255,7 @@ def _converted_errors(kind: ImageFormat, name: str) -> Iterator[None]:
 
 
 def _check_budget(size: tuple[int, int], size_bytes: int, name: str) -> None:
+    """Raise an `InputError` if an image of `size` (width, height) has too many pixels for its file size in bytes."""
     most = max(FREE_PIXELS, PIXELS_PER_BYTE * size_bytes)
     if size[0] * size[1] > most:
         raise InputError(

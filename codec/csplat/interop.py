@@ -146,7 +146,7 @@ def to_gsplat(
 
 
 def _array(name: str, value: Any) -> F32:
-    """Copy an array or a tensor of any device to float32."""
+    """Copy an array or a tensor of any device to float32; raise an `InputError` for other values."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().float().numpy()  # float: NumPy has no bfloat16
     try:
@@ -157,11 +157,13 @@ def _array(name: str, value: Any) -> F32:
 
 
 def _reshape(name: str, array: F32, shape: tuple[int, ...], also: tuple[int, ...]) -> F32:
+    """Reshape an array of shape `shape` or `also` to `shape`; raise an `InputError` for another shape."""
     if array.shape not in (shape, also):
         raise InputError(f"{name} has shape {list(array.shape)}, expected {list(also)}")
     return array.reshape(shape)
 
 
 def _check_form(form: str) -> None:
+    """Raise an `InputError` unless `form` is a value of `Form`."""
     if form not in get_args(Form):
         raise InputError(f"form is {form!r}, expected one of {', '.join(get_args(Form))}")

@@ -248,6 +248,7 @@ def _check_quats(quats: F32) -> None:
 
 
 def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
+    """Raise an `InputError` unless extra columns are arrays [n] of integers or floats."""
     for name, column in extra.items():
         if not isinstance(column, np.ndarray) or column.shape != (n,):
             raise InputError(f"extra column {name!r} is not an array of {n} values")
@@ -256,6 +257,7 @@ def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
 
 
 def _parse_origin(origin: Sequence[float]) -> tuple[float, float, float]:
+    """Convert an origin to three floats; raise an `InputError` unless it is three finite numbers."""
     try:
         x, y, z = (float(value) for value in origin)
     except (TypeError, ValueError):

@@ -37,6 +37,7 @@ def load_plugins(group: str) -> dict[str, Any]:
 
 @cache
 def _entry_points(group: str) -> EntryPoints:
+    """Return the entry points of a group from the metadata of all installed packages."""
     from importlib.metadata import entry_points  # takes 20 ms, the look-up another 10 ms with 120 packages
 
     return entry_points(group=group)

@@ -42,6 +42,7 @@ _LOG = (  # from the highest power
     float.fromhex("0x1.5555555555593p-1"),
 )
 _ROOT_HALF = 0.5**0.5
+_EXPONENT_BIAS, _FRACTION_BITS = 1023, 52  # of binary64
 
 
 def exp(x: NDArray[Any] | float) -> F64:
@@ -83,7 +84,7 @@ def _flat(x: NDArray[Any] | float) -> tuple[F64, F64]:
 
 
 def _exp_block(x: F64, out: F64) -> None:
-    """Write e**x of x [n] to `out` [n].
+    """Write e**x of x [n] to `out` [n]; 0 and infinity where that leaves float64, NaN for NaN.
 
     With x = k ln 2 + r, |r| <= ln 2 / 2, and c = r - r² P(r²): e**x = 2**k (1 + r + r c / (2 - c)).
     """
@@ -108,9 +109,9 @@ def _exp_block(x: F64, out: F64) -> None:
     out += high
     out += 1.0
     if small:
-        bits: I64 = k.astype(np.int64)
-        bits += 1023
-        bits <<= 52
+        bits: I64 = k.astype(np.int64)  # 2**k as the bits of a float64
+        bits += _EXPONENT_BIAS
+        bits <<= _FRACTION_BITS
         out *= bits.view(np.float64)
         return
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
@@ -120,7 +121,8 @@ def _exp_block(x: F64, out: F64) -> None:
 def _log_block(x: F64) -> tuple[F64, F64]:
     """Return k and log(m), both [n], of x = 2**k m, [n], with √½ <= m < √2.
 
-    With f = m - 1 and s = f / (2 + f): log(m) = f - f²/2 + s (f²/2 + R(s²)).
+    With f = m - 1 and s = f / (2 + f): log(m) = f - f²/2 + s (f²/2 + R(s²)). For 0, infinity, NaN and negative
+    x, k is 0 and log(m) is -infinity, infinity, NaN and NaN.
     """
     m, exponent = np.frexp(x)
     low = m < _ROOT_HALF
@@ -131,17 +133,17 @@ def _log_block(x: F64) -> tuple[F64, F64]:
         s = f / (f + 2.0)
         special = ~((x > 0.0) & (x < np.inf))
     square = s * s
-    rest = square * _LOG[0]
+    log_m = square * _LOG[0]  # R(s²) until the loop ends
     for coefficient in _LOG[1:]:
-        rest += coefficient
-        rest *= square
+        log_m += coefficient
+        log_m *= square
     half = f * f
     half *= 0.5
-    rest += half
-    rest *= s
-    rest -= half
-    rest += f
+    log_m += half
+    log_m *= s
+    log_m -= half
+    log_m += f
     if special.any():
         k[special] = 0.0
-        rest[special] = np.where(x[special] == 0.0, -np.inf, np.where(x[special] > 0.0, np.inf, np.nan))
-    return k, rest
+        log_m[special] = np.where(x[special] == 0.0, -np.inf, np.where(x[special] > 0.0, np.inf, np.nan))
+    return k, log_m

@@ -103,6 +103,13 @@ class RemoteStore(Store):
         super().__init__(self._shown, size, requests=1)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Read each range, requesting what is missing of it until it is complete or nothing more arrives.
+
+        A part may still be shorter than its range: `read` checks that.
+
+        Raises:
+            StoreError, OSError, InputError: as in `_wait`.
+        """
         parts = [b""] * len(ranges)
         repeats = 0
         for round_ in range(_MAX_ROUNDS):
@@ -125,7 +132,7 @@ class RemoteStore(Store):
         return parts
 
     def _answers(self, ranges: Sequence[tuple[int, int]]) -> list[Any]:
-        """Request ranges, and return the bytes of each, which may be too few, or an exception."""
+        """Request one or more ranges, and return the bytes of each, which may be too few, or an exception."""
         starts, stops = zip(*ranges, strict=True)
         # File systems without coroutines open files, which would read ahead.
         cache = {} if self._fs.async_impl else {"cache_type": "none"}
@@ -137,6 +144,14 @@ class RemoteStore(Store):
         return answers
 
     def _read_info(self, waits: Sequence[float]) -> dict[str, Any]:
+        """Return fsspec's description of the file (`size`, `type` and others).
+
+        Args:
+            waits: break before each repetition, seconds; none are repeated if it is empty.
+
+        Raises:
+            StoreError, OSError, InputError: as in `_wait`.
+        """
         repeats = 0
         while True:
             try:
@@ -169,6 +184,7 @@ class RemoteStore(Store):
         time.sleep(wait)
 
     def _is_other(self) -> bool:
+        """Request the description again, once, and return True if a field of `_VERSION` has changed since opening."""
         self._fs.invalidate_cache(self._path)
         self.requests += 1
         now = self._read_info(())
@@ -180,7 +196,12 @@ class RemoteStore(Store):
         return error.__cause__ or error if wrapped else error
 
     def _failure(self, error: BaseException, repeats: int) -> Exception:
-        """Translate an exception of fsspec, after a number of repetitions."""
+        """Return the error to raise for an exception of fsspec, after a number of repetitions.
+
+        Returns:
+            An `OSError` for a file that is absent or may not be read, an error that names a missing package, or a
+            `StoreError` for anything else.
+        """
         if isinstance(error, ModuleNotFoundError):
             return missing_package(error, extra="remote")
         error = self._cause(error)
@@ -261,7 +282,7 @@ def _describe_fault(answer: Any) -> str:
 
 
 def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
-    """Return fsspec's file system for a URL, and the path in it."""
+    """Return fsspec's file system for a URL, and the path in it; raise an `InputError` if a package is missing."""
     try:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:

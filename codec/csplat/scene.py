@@ -150,6 +150,7 @@ class Scene:
 
     @cached_property
     def _resources(self) -> ExitStack:
+        """Resources that are closed with the scene; created empty on first use."""
         return ExitStack()
 
     def keep_open(self, resources: ExitStack) -> Self:

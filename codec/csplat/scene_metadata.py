@@ -161,13 +161,13 @@ class TrainingRecord:
         """
         if not isinstance(record, Mapping):
             raise InputError(f"{TRAINING} is {record!r}, expected an object")
-        background = _member(
-            record, "background", lambda value: _are(value, 3, _is_fraction), "three numbers of 0 to 1"
+        background = _get_member(
+            record, "background", lambda value: _are_valid(value, 3, _is_fraction), "three numbers of 0 to 1"
         )
-        size = _member(record, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
-        near = _member(record, "near", _is_length, "a number above 0")
-        every = _member(record, "test_every", _is_interval, "0, or a whole number above 1")
-        images = _member(record, "images", _is_name, "a name")
+        size = _get_member(record, "size", lambda value: _are_valid(value, 2, _is_count), "two whole numbers above 0")
+        near = _get_member(record, "near", _is_length, "a number above 0")
+        every = _get_member(record, "test_every", _is_interval, "0, or a whole number above 1")
+        images = _get_member(record, "images", _is_name, "a name")
         if background is None:
             raise InputError(f"{TRAINING} has no background")
         red, green, blue = (float(value) for value in background)
@@ -232,32 +232,39 @@ def check_axes(letters: str) -> None:
         raise InputError(f"the axes are {letters!r}, expected three letters, one each of R/L, U/D and F/B, such as RDF")
 
 
-def _member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], expected: str) -> Any:
+def _get_member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], expected: str) -> Any:
+    """Return a member of a training record, or `None` if it is absent; raise an `InputError` if it is invalid."""
     value = record.get(name)
     if value is not None and not is_valid(value):
         raise InputError(f"{name} of {TRAINING} is {value!r}, expected {expected}")
     return value
 
 
-def _are(values: object, count: int, is_valid: Callable[[Any], bool]) -> bool:
+def _are_valid(values: object, count: int, is_valid: Callable[[Any], bool]) -> bool:
+    """Return True if `values` is a list or tuple of `count` valid values."""
     return isinstance(values, list | tuple) and len(values) == count and all(is_valid(value) for value in values)
 
 
 def _is_fraction(value: Any) -> bool:
+    """Return True for a number from 0 to 1."""
     return type(value) in (int, float) and 0.0 <= value <= 1.0
 
 
 def _is_length(value: Any) -> bool:
+    """Return True for a finite number above 0."""
     return type(value) in (int, float) and 0.0 < value <= sys.float_info.max
 
 
 def _is_interval(value: Any) -> bool:
+    """Return True for 0 or an integer from 2 to `_MAX_COUNT`."""
     return type(value) is int and (value == 0 or 1 < value <= _MAX_COUNT)
 
 
 def _is_name(value: Any) -> bool:
+    """Return True for a printable text that is not empty; surrogates and line breaks are not printable."""
     return isinstance(value, str) and value.isprintable() and value != ""  # excludes surrogates and line breaks
 
 
 def _is_count(value: Any) -> bool:
+    """Return True for an integer from 1 to `_MAX_COUNT`."""
     return type(value) is int and 0 < value <= _MAX_COUNT

@@ -122,7 +122,7 @@ class SplatFile(Scene):
         """
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_TREE))
+            window.fetch(self._chunk_ranges(_spec.CHUNK_TREE))
             return read_nodes(window.view, self.header)
 
     @cached_property
@@ -130,7 +130,7 @@ class SplatFile(Scene):
         """Metadata of the scene; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS))
+            window.fetch(self._chunk_ranges(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS))
             return scene_metadata(window.view, self.header, self._limits)
 
     @cached_property
@@ -138,7 +138,7 @@ class SplatFile(Scene):
         """The encoder's record of its options, if any; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_OPTIONS))
+            window.fetch(self._chunk_ranges(_spec.CHUNK_OPTIONS))
             options: dict[str, Any] | None = json_chunk(
                 window.view, self.header, _spec.CHUNK_OPTIONS, self._limits.json_bytes
             )
@@ -149,7 +149,7 @@ class SplatFile(Scene):
         """Declared error bounds, if there are any; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_DECLARED_ERRORS))
+            window.fetch(self._chunk_ranges(_spec.CHUNK_DECLARED_ERRORS))
             return bounds_chunk(window.view, self.header)
 
     def loaded(self) -> SplatFile:
@@ -331,10 +331,10 @@ class SplatFile(Scene):
         with self._store.named_errors():
             window = self.window()
             request = prepare_decode(window.view, self.header, self._limits, tiles, sh_degree)
-            texts = self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
+            texts = self._chunk_ranges(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
             splat_bytes = float_bytes(self.header, request.degree)
             check_budget(self.header, request.tiles, request.degree, splat_bytes, self._limits, whole=request.whole)
-            window.fetch([*texts, *_side(request), *_layers(request.tiles, request.degree)])
+            window.fetch([*texts, *_side_ranges(request), *_layer_ranges(request.tiles, request.degree)])
             return decode_request(request).model
 
     def window(self) -> FileWindow:
@@ -344,6 +344,7 @@ class SplatFile(Scene):
         return FileWindow(self._store, self._head)
 
     def _decode(self, tiles: Sequence[int] | None, sh_degree: int | None) -> Iterator[DecodedTile]:
+        """Return an iterator over decoded tiles; tile numbers and degree are checked before the first is read."""
         with self._store.named_errors():
             window = self.window()
             request = prepare_decode(window.view, self.header, self._limits, tiles, sh_degree)
@@ -351,13 +352,20 @@ class SplatFile(Scene):
         return self._iterate(window, request, decoded)
 
     def _iterate(self, window: FileWindow, request: DecodeRequest, decoded: Iterator[_T]) -> Iterator[_T]:
-        side = _side(request)
+        """Yield the results of `decoded` in order, after fetching the chunks of each batch that it is about to read.
+
+        Chunks that are not of tiles are fetched with the first batch. The window keeps one batch at a time.
+
+        Raises:
+            InputError: the file was closed in the meantime.
+        """
+        side = _side_ranges(request)
         for batch in _batches(request.tiles, request.degree, self._store.sizes.batch):
             if not self._open:
                 raise InputError(f"{self.name} is closed")
             window.forget()
             with self._store.named_errors():
-                window.fetch([*side, *_layers(batch, request.degree)])
+                window.fetch([*side, *_layer_ranges(batch, request.degree)])
             for _ in batch:
                 with self._store.named_errors():
                     tile = next(decoded)
@@ -370,11 +378,13 @@ class SplatFile(Scene):
         """Return the tiles of level 0, or `None` for a file without other levels, which is then read as a whole."""
         return range(len(self.header.tiles)) if self.header.coarse_tiles else None
 
-    def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
+    def _chunk_ranges(self, *kinds: bytes) -> list[tuple[int, int]]:
+        """Return (offset, size) of the directory's chunks of some types."""
         return [(record.offset, record.size) for record in self.header.directory if record.type in kinds]
 
 
 def _levels_finding(header: SceneHeader, which: str) -> Finding:
+    """Report that a file has coarser levels; `which` describes the one that is read."""
     last = max(tile.level for tile in header.coarse_tiles)
     return Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")
 
@@ -391,7 +401,7 @@ def _read_head(store: Store, window: FileWindow) -> bytes:
     return bytes(window.view[: max(first, end)])
 
 
-def _side(request: DecodeRequest) -> list[tuple[int, int]]:
+def _side_ranges(request: DecodeRequest) -> list[tuple[int, int]]:
     """Return the ranges to read in addition to tiles: their codebooks, or all other chunks for a whole file."""
     records = (
         request.header.directory if request.whole else wanted_codebooks(request.header, request.tiles, request.degree)
@@ -399,7 +409,8 @@ def _side(request: DecodeRequest) -> list[tuple[int, int]]:
     return [(record.offset, record.size) for record in records]
 
 
-def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
+def _layer_ranges(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
+    """Return (offset, size) of the layer chunks that decoding to an SH degree needs."""
     return [(layer.offset, layer.size) for tile in tiles for layer in wanted_layers(tile, degree)]
 
 
@@ -450,12 +461,14 @@ def box_corners(box: Sequence[float]) -> F64:
 
 
 def _nothing_touches(header: SceneHeader, corners: F64) -> InputError:
+    """Return the error for a box, corners [2, 3], that no tile touches; it states the extent of the scene."""
     low, high = corners
     extent = _extent_text(tile_boxes(header, header.tiles))
     return InputError(f"no tile touches the box {_corner_text(low)} to {_corner_text(high)}: {extent}")
 
 
 def _corner_text(corner: F64) -> str:
+    """Format a corner [3] for messages, with nine digits, which tell numbers of binary32 apart."""
     return ", ".join(f"{value:.9g}" for value in corner)  # tells numbers of binary32 apart
 
 

@@ -186,6 +186,10 @@ def default_memory_bytes() -> int:
 
 
 def _free_machine_bytes() -> int:
+    """Return the available memory of the machine in bytes.
+
+    Without /proc/meminfo, half of the physical memory counts as available; `_UNKNOWN` if that is unknown, too.
+    """
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text("ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -216,9 +220,9 @@ def map_in_processes(
         return
     start = "forkserver" if CAN_FORK else "spawn"
     workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin, (work, shared))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin_worker, (work, shared))
     try:
-        futures = {pool.submit(_call, item): item for item in items}
+        futures = {pool.submit(_call_in_worker, item): item for item in items}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
     except BrokenProcessPool:
@@ -227,11 +231,13 @@ def map_in_processes(
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(work: Callable[..., Any], shared: Any) -> None:
+def _begin_worker(work: Callable[..., Any], shared: Any) -> None:
+    """Set up a worker process: ignore SIGINT and keep the arguments that all calls share in `_task`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it and ends its workers
     _task[:] = [work, shared]
 
 
-def _call(item: Any) -> Any:
+def _call_in_worker(item: Any) -> Any:
+    """Return the result for an item, in a worker process that `_begin_worker` has set up."""
     work, shared = _task
     return work(shared, item)

@@ -48,7 +48,7 @@ def answer(data: bytes, limits: Limits | None = None, *, context: Context = DEFA
     try:
         header, arrays = _decode(data, limits, context)
     except CsplatError as error:
-        code, clause, offset = _place(error)
+        code, clause, offset = _error_place(error)
         seconds = time.monotonic() - began
         return Answer(Status.REFUSED, str(error), code=code, clause=clause, offset=offset, seconds=seconds)
     except _DifferError as error:
@@ -114,7 +114,12 @@ class _DifferError(Exception):
 
 
 def _decode(data: bytes, limits: Limits | None, context: Context) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return header fields, and raw values by `part.name`."""
+    """Decode a file twice, to values and to integers; return header fields, and raw values by `part.name`.
+
+    Raises:
+        CsplatError: the file is refused.
+        _DifferError: only one of the functions refuses it, or they report different errors.
+    """
     from csplat import decoder  # not needed to read the manifest
 
     results: list[Any] = []
@@ -128,14 +133,16 @@ def _decode(data: bytes, limits: Limits | None, context: Context) -> tuple[dict[
         raise integers  # `decode` leaves coarser payloads unread, so it may report another fault
     if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
         # A budget counts the bytes of the returned arrays, which differ between the two functions.
-        if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
+        if _error_place(model) != _error_place(integers) and not any(
+            isinstance(result, LimitError) for result in results
+        ):
             words = [str(result) if isinstance(result, CsplatError) else "accepted" for result in results]
             raise _DifferError(f"decode and decode_integers differ: {words[0]}; {words[1]}")
         raise model if isinstance(model, CsplatError) else integers
-    arrays = {f"floats.{name}": _raw(getattr(model, name)) for name in _FLOATS}
-    arrays |= {f"integers.{name}": _raw(array) for name, array in integers.items()}
-    arrays |= {f"extra.{name}": _raw(array) for name, array in model.extra.items()}
-    return _facts(decoder.read_header(data)), arrays
+    arrays = {f"floats.{name}": _raw_bytes(getattr(model, name)) for name in _FLOATS}
+    arrays |= {f"integers.{name}": _raw_bytes(array) for name, array in integers.items()}
+    arrays |= {f"extra.{name}": _raw_bytes(array) for name, array in model.extra.items()}
+    return _manifest_header(decoder.read_header(data)), arrays
 
 
 def _has_levels(data: bytes) -> bool:
@@ -148,16 +155,17 @@ def _has_levels(data: bytes) -> bool:
         return False
 
 
-def _place(result: Any) -> tuple[str, str | None, int | None]:
+def _error_place(result: Any) -> tuple[str, str | None, int | None]:
     """Return code, clause and offset of an error; empty values for other results."""
     return getattr(result, "code", ""), getattr(result, "clause", None), getattr(result, "offset", None)
 
 
-def _raw(array: NDArray[Any]) -> bytes:
+def _raw_bytes(array: NDArray[Any]) -> bytes:
+    """Return the values little-endian in C order."""
     return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
 
 
-def _facts(header: Any) -> dict[str, Any]:
+def _manifest_header(header: Any) -> dict[str, Any]:
     """Return the header fields in the form of the manifest."""
     flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
     return {
@@ -191,7 +199,7 @@ def main(words: Sequence[str] | None = None) -> int:
             return 0
         header, arrays = _decode(args.input.read_bytes(), None, DEFAULT_CONTEXT)
     except CsplatError as error:
-        code, clause, offset = _place(error)
+        code, clause, offset = _error_place(error)
         sys.stdout.write(json.dumps({"code": code, "offset": offset, "clause": clause}) + "\n")
         return 1
     (args.outdir / "header.json").write_text(json.dumps(header), encoding="utf-8")

@@ -31,6 +31,7 @@ LEVELS = (*PARTS, RENDERS, CUTS)
 
 #: Tiles of a cut, or an error code.
 Cut = Sequence[int] | str
+_EXACT_MAX = 2**53  # integers up to this magnitude are exact in binary64
 _SHOWN_MAX = 60  # characters of a cut in a message
 
 #: Returns the float arrays of a vector by its name.
@@ -84,14 +85,14 @@ def compare_answer(
         near: returns the exact floats of a vector, for decoders of the class renderer.
     """
     if vector.error:
-        return [_check_refused(vector, answer, exact)] if 1 in levels else []
+        return [_check_invalid(vector, answer, exact)] if 1 in levels else []
     result = []
     for level, parts in PARTS.items():
         if level not in levels or not any(vector.expect[part] for part in parts):
             continue
         status, message = answer.status, answer.message
         if status is Status.PASSED:
-            status, message = _compare(vector, answer, parts, near)
+            status, message = _compare_parts(vector, answer, parts, near)
         elif status is Status.REFUSED:
             message = message or "refused a valid file"
         passed = status is Status.PASSED
@@ -112,7 +113,11 @@ def compare_answer(
 # Refusals ------------------------------------------------------------------------------------------
 
 
-def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
+def _check_invalid(vector: Vector, answer: Answer, exact: bool) -> Outcome:
+    """Compare the answer for an invalid vector (L1).
+
+    An optional error may be accepted unless `exact`; its outcome has details for `check_payload_consistency`.
+    """
     expected = vector.error
     status, message = answer.status, answer.message
     details = {}
@@ -131,7 +136,10 @@ def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
 
 
 def _match_refusal(answer: Answer, expected: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
-    """Compare a refusal. Only `exact` compares codes: another order of checks may find another code first."""
+    """Return the status and a message about a refusal that differs from the planted error.
+
+    Only `exact` compares clause and offset, and makes another code a failure, because the order of checks is free.
+    """
     actual = _describe_error(answer.code, answer.clause, answer.offset)
     planted = f"planted {_describe_error(expected['code'], expected['clause'], expected['offset'])}, reported {actual}"
     if exact:
@@ -141,6 +149,7 @@ def _match_refusal(answer: Answer, expected: Mapping[str, Any], exact: bool) -> 
 
 
 def _describe_error(code: str, clause: str | None, offset: int | None) -> str:
+    """Return `E_CRC at byte 64 by CHK-1`, without the parts that are `None`."""
     where = "" if offset is None else f" at byte {offset}"
     return f"{code}{where}" + (f" by {clause}" if clause else "")
 
@@ -176,7 +185,13 @@ def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome
 # Arrays --------------------------------------------------------------------------------------------
 
 
-def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: FloatsByVector | None) -> tuple[Status, str]:
+def _compare_parts(
+    vector: Vector, answer: Answer, parts: tuple[str, ...], near: FloatsByVector | None
+) -> tuple[Status, str]:
+    """Compare parts of an answer with the manifest; return the worst status and all messages.
+
+    Arrays that the manifest does not list are failures. Without `near`, floats must be equal bit for bit.
+    """
     if not answer.header and not answer.arrays:
         return Status.NO_OUTPUT, "nothing was written"
     if "header" in parts:
@@ -186,26 +201,27 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
         for name, summary in vector.expect[part].items():
             key = f"{part}.{name}"
             wrong += _compare_size(key, summary, answer.arrays.get(key)) or _compare_values(vector, answer, key, near)
-        more = [key for key in answer.arrays if key.split(".", 1)[0] == part]
-        extra = [key for key in more if key.split(".", 1)[1] not in vector.expect[part]]
-        wrong += [(Status.FAILED, f"{key}: unexpected array") for key in extra]
+        part_keys = [key for key in answer.arrays if key.split(".", 1)[0] == part]
+        unexpected = [key for key in part_keys if key.split(".", 1)[1] not in vector.expect[part]]
+        wrong += [(Status.FAILED, f"{key}: unexpected array") for key in unexpected]
     if not wrong:
         return Status.PASSED, ""
-    return max((status for status, _ in wrong), key=_severity), "; ".join(text for _, text in wrong)
+    return max((status for status, _ in wrong), key=_rank_failure), "; ".join(text for _, text in wrong)
 
 
-def _severity(status: Status) -> int:
-    """Rank the failure of an array. The failure with the largest rank is the status of the vector."""
+def _rank_failure(status: Status) -> int:
+    """Rank the failure of an array: FAILED below PARTIAL_OUTPUT below WRONG_ANSWER, the largest decides."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
 
 
 def whole_number(text: str) -> float:
     """Convert a JSON integer. Numbers beyond 2^53 become floats, because JavaScript writes 2^65 as an integer."""
     value = float(text)
-    return int(text) if abs(value) <= 2**53 else value
+    return int(text) if abs(value) <= _EXACT_MAX else value
 
 
 def _compare_header(expect: Mapping[str, Any], header: Mapping[str, Any]) -> tuple[Status, str]:
+    """Compare the fields of `expect` with those of a header, which may have more; flags in any order."""
     if not header:
         return Status.WRONG_ANSWER, "no header.json"
     wrong = []
@@ -219,6 +235,7 @@ def _compare_header(expect: Mapping[str, Any], header: Mapping[str, Any]) -> tup
 
 
 def _compare_size(key: str, summary: list[Any], array: tuple[int, str] | None) -> list[tuple[Status, str]]:
+    """Return a failure if an array is missing or does not have the size of its `summary`: dtype, shape, SHA-256."""
     dtype, shape, _ = summary
     if array is None:
         return [(Status.WRONG_ANSWER, f"{key} is missing")]
@@ -230,6 +247,7 @@ def _compare_size(key: str, summary: list[Any], array: tuple[int, str] | None) -
 
 
 def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsByVector | None) -> list[tuple[Status, str]]:
+    """Return a failure if an array of the right size differs; floats may differ by a tolerance if `near` is given."""
     part, name = key.split(".", 1)
     if answer.arrays[key][1] == vector.expect[part][name][2]:
         return []
@@ -262,34 +280,40 @@ def skip_cuts(vector: Vector, why: str) -> Outcome:
 
 
 def _compare_cuts(expect: Sequence[tuple[str, Cut]], cuts: Sequence[Cut]) -> tuple[Status, str]:
+    """Compare the answers to cuts, (text, expected) each.
+
+    A cut is not compared if it needs a feature that the decoder supports in no cut. Without any, the result is SKIPPED.
+    """
     if len(cuts) != len(expect):
         status = Status.PARTIAL_OUTPUT if len(cuts) < len(expect) else Status.FAILED
         return (status if cuts else Status.NO_OUTPUT), f"{len(cuts)} cuts, expected {len(expect)}, a line for each"
-    answered = (text for (text, _), cut in zip(expect, cuts, strict=True) if cut != _spec.ERROR_UNSUPPORTED)
-    offered = {kind for text in answered for kind in _kinds(text)}
+    supported = (text for (text, _), cut in zip(expect, cuts, strict=True) if cut != _spec.ERROR_UNSUPPORTED)
+    offered = {kind for text in supported for kind in _required_features(text)}
     wrong = [
-        f"the cut {_shorten(text)!r} is {_shorten(_cut_text(cut))}, expected {_shorten(_cut_text(wanted))}"
-        for (text, wanted), cut in zip(expect, cuts, strict=True)
-        if cut != wanted and _kinds(text) <= offered
+        f"the cut {_shorten(text)!r} is {_shorten(_cut_text(cut))}, expected {_shorten(_cut_text(expected))}"
+        for (text, expected), cut in zip(expect, cuts, strict=True)
+        if cut != expected and _required_features(text) <= offered
     ]
     if wrong:
         more = f"; {len(wrong) - 1} of the other {len(expect) - 1} cuts are wrong, too" if len(wrong) > 1 else ""
         return Status.FAILED, wrong[0] + more
-    missing = sorted({kind for text, _ in expect for kind in _kinds(text)} - offered)
+    missing = sorted({kind for text, _ in expect for kind in _required_features(text)} - offered)
     if missing:
         return (Status.PASSED if offered else Status.SKIPPED), f"the decoder offers no cut by {', '.join(missing)}"
     return Status.PASSED, ""
 
 
-def _kinds(text: str) -> set[str]:
+def _required_features(text: str) -> set[str]:
     """Return what a decoder needs to offer for a cut: `level`, `pixel_size` or `splats`, and perhaps `box`."""
     words = text.split()
     return {words[0], "box"} & {*words}
 
 
 def _cut_text(cut: Cut) -> str:
+    """Return the tiles of a cut separated by blanks, `empty` for none, or the error code."""
     return cut if isinstance(cut, str) else " ".join(map(str, cut)) or "empty"
 
 
 def _shorten(text: str) -> str:
+    """Cut a text to `_SHOWN_MAX` characters, with an ellipsis."""
     return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}…"

@@ -125,10 +125,12 @@ class ConformanceReport:
 
 
 def _levels(report: ConformanceReport) -> list[str]:
+    """Return the levels that occur, in ascending order."""
     return sorted({outcome.level for outcome in report.outcomes})
 
 
 def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, int]:
+    """Count outcomes: all checks, the good ones by status (`extra` must list those of the suite), and failures."""
     counts = dict.fromkeys(("checks", "passed", *map(str, extra), "failed", "skipped"), 0)
     for outcome in outcomes:
         counts["checks"] += 1
@@ -143,9 +145,9 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
         report: the run.
         verbose: include a line for every check.
     """
-    shown = [outcome for outcome in report.outcomes if verbose or outcome.message or not outcome.good]
+    listed = [outcome for outcome in report.outcomes if verbose or outcome.message or not outcome.good]
     lines = _align_columns(
-        [(outcome.level, _word(outcome.status), outcome.name, _remark(outcome)) for outcome in shown]
+        [(outcome.level, _word(outcome.status), outcome.name, _remark(outcome)) for outcome in listed]
     )
     lines += [""] * bool(lines)
     lines += [*report.notes]
@@ -161,6 +163,7 @@ def _word(status: Status) -> str:
 
 
 def _remark(outcome: Outcome) -> str:
+    """Return the message on one line, with clauses and code unless the outcome is good and has no message."""
     message = " ".join(outcome.message.split())  # may come from a foreign program: keep it on one line
     where = ", ".join([*outcome.clauses, *([outcome.code] if outcome.code else [])])
     if not where or (outcome.good and not message):
@@ -169,7 +172,7 @@ def _remark(outcome: Outcome) -> str:
 
 
 def _align_columns(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
-    """Align columns to the left or, except for the first, to the right."""
+    """Return a line for each row, with columns aligned to the left or, except for the first, to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     lines = []
     for row in rows:
@@ -194,6 +197,7 @@ def to_json(report: ConformanceReport) -> dict[str, Any]:
 
 
 def _outcome_json(outcome: Outcome) -> dict[str, Any]:
+    """Return an outcome as JSON-compatible values."""
     return {
         "name": outcome.name,
         "level": outcome.level,
@@ -214,6 +218,7 @@ def to_junit(report: ConformanceReport) -> str:
 
 
 def _junit_suite(report: ConformanceReport, level: str) -> str:
+    """Return the XML of a test suite with the outcomes of a level; subject and notes are its properties."""
     outcomes = [outcome for outcome in report.outcomes if outcome.level == level]
     name = f"csplat.{report.suite}.{level}"
     cases = [_junit_case(outcome, name) for outcome in outcomes]
@@ -224,6 +229,7 @@ def _junit_suite(report: ConformanceReport, level: str) -> str:
 
 
 def _junit_totals(outcomes: Sequence[Outcome]) -> str:
+    """Return the XML attributes with numbers of tests, failures, errors and skipped tests, and the time in seconds."""
     errors = sum(outcome.status in _ERRORS for outcome in outcomes)
     failures = sum(not outcome.good for outcome in outcomes) - errors
     skipped = sum(outcome.status in _OPEN for outcome in outcomes)
@@ -232,6 +238,7 @@ def _junit_totals(outcomes: Sequence[Outcome]) -> str:
 
 
 def _junit_case(outcome: Outcome, suite: str) -> str:
+    """Return the XML of a test case: warnings as its output, unchecked ones as skipped."""
     head = f'    <testcase classname="{_xml(suite)}" name="{_xml(outcome.name)}" time="{outcome.seconds:.3f}"'
     if outcome.status is Status.PASSED:
         return head + "/>"

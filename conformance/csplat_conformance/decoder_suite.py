@@ -126,6 +126,7 @@ def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgr
 
 
 def _own_cuts(vector: Vector) -> Answer:
+    """Return the answer of csplat's decoder to the cuts of a vector."""
     try:
         return Answer(Status.PASSED, cuts=adapter.cuts_of(vector.data, cuts_of_vector(vector)))
     except CsplatError as error:
@@ -170,10 +171,10 @@ def run_command(
                 outcomes += reference_renders.skip_views(vector, "no command of a renderer was given")
             else:
                 outcomes += reference_renders.score_renderer(vector, render, options.timeout)
-        wanted = cuts_of_vector(vector) if CUTS in options.levels else []
-        if wanted and cuts is not None:
-            outcomes.append(compare_cuts(vector, ask_cuts(cuts, VECTORS / vector.file, wanted, options.timeout)))
-        elif wanted:
+        vector_cuts = cuts_of_vector(vector) if CUTS in options.levels else []
+        if vector_cuts and cuts is not None:
+            outcomes.append(compare_cuts(vector, ask_cuts(cuts, VECTORS / vector.file, vector_cuts, options.timeout)))
+        elif vector_cuts:
             outcomes.append(skip_cuts(vector, "no command for cuts was given"))
         return outcomes
 
@@ -208,6 +209,7 @@ def _make_report(
     options: DecoderSuiteOptions,
     progress: CountProgress | None,
 ) -> ConformanceReport:
+    """Collect the outcomes of each vector as they arrive, report progress, and check CHK-7 over all of them."""
     outcomes: list[Outcome] = []
     for done, vector_outcomes in enumerate(results, 1):
         outcomes += vector_outcomes

@@ -38,7 +38,7 @@ class Writer:
         """Append a structure of the registry, with fields named `name.field`."""
         packer: struct.Struct = getattr(_spec, f"{structure.upper()}_STRUCT")
         offsets: dict[str, int] = getattr(_spec, f"{structure.upper()}_OFFSETS")
-        for key, (offset, code) in _formats(packer.format, offsets).items():
+        for key, (offset, code) in _split_format(packer.format, offsets).items():
             self.fields[f"{name}.{key}"] = Field(len(self.data) + offset, code, structure)
         flat = [v for value in values for v in (value if isinstance(value, tuple) else (value,))]
         self.data += packer.pack(*flat)
@@ -89,6 +89,7 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
         out.raw("index.tail", data[len(out.data) : _spec.HEADER_SIZE + head.head_size])
 
     def record(name: str, structure: str) -> tuple[int, ...]:
+        """Append the next record and the tail that `head` gives it, if any, to `out`; return its values."""
         unpack = getattr(_spec, f"unpack_{structure}")
         values: tuple[int, ...] = unpack(data, len(out.data))
         at = len(out.data)
@@ -122,8 +123,11 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
     return out.fields, dict(sorted(spans.items(), key=lambda item: item[1]))
 
 
-def _formats(packed: str, offsets: dict[str, int]) -> dict[str, tuple[int, str]]:
-    """Split a struct format at the offsets of the fields: name to (offset, format)."""
+def _split_format(packed: str, offsets: dict[str, int]) -> dict[str, tuple[int, str]]:
+    """Split a struct format at the offsets of the fields; return offset and format of each field by name.
+
+    A field has all codes up to the offset of the next one. The first field is at offset 0.
+    """
     codes = re.findall(r"\d*[a-zA-Z]", packed.lstrip("<"))
     result: dict[str, tuple[int, str]] = {}
     at, name = 0, ""

@@ -76,6 +76,7 @@ def summarise(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
 
 
 def _summary(array: NDArray[Any]) -> list[Any]:
+    """Return one entry of `summarise`; the dtype as `f4`."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     name = f"{array.dtype.kind}{array.dtype.itemsize}"
     return [name, list(array.shape), hashlib.sha256(little.tobytes()).hexdigest()]

@@ -75,10 +75,10 @@ def read_answer(end: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> 
     """
     if end.status is not None:
         return Answer(end.status, end.message + last_words(end), seconds=end.seconds)
-    left = sorted(entry.name for entry in outdir.iterdir())
+    names = sorted(entry.name for entry in outdir.iterdir())
     if end.returncode == 1:
-        return _read_refusal(end, left)
-    return _read_arrays(outdir, left, end.seconds, keep_floats=keep_floats)
+        return _read_refusal(end, names)
+    return _read_arrays(outdir, names, end.seconds, keep_floats=keep_floats)
 
 
 def ask_cuts(command: str, path: Path, cuts: Sequence[str], timeout: float) -> Answer:
@@ -100,6 +100,7 @@ def ask_cuts(command: str, path: Path, cuts: Sequence[str], timeout: float) -> A
 
 
 def _read_cuts(end: ProcessEnd) -> Answer:
+    """Parse standard output: tiles or an error code in each line; an empty line is a cut without tiles."""
     cuts: list[list[int] | str] = []
     for line in end.stdout.decode("utf-8", "replace").splitlines():
         words = line.split()
@@ -113,7 +114,8 @@ def _read_cuts(end: ProcessEnd) -> Answer:
     return Answer(Status.PASSED, cuts=cuts, seconds=end.seconds)
 
 
-def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:
+def _read_refusal(end: ProcessEnd, outputs: list[str]) -> Answer:
+    """Parse the last line of standard output as a refusal; `outputs`, names of files left behind, make it a failure."""
     try:
         facts: dict[str, Any] = dict(json.loads((end.stdout.splitlines() or [b""])[-1]))
         code, clause, offset = facts["code"], facts.get("clause"), facts.get("offset")
@@ -122,8 +124,8 @@ def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:
     except (ValueError, LookupError, TypeError, RecursionError):
         text = f"exit status 1 without a line of JSON that has a code{last_words(end)}"
         return Answer(Status.WRONG_ANSWER, text, seconds=end.seconds)
-    if left:
-        return Answer(Status.PARTIAL_OUTPUT, f"refused, but left {', '.join(left)}", code=code, seconds=end.seconds)
+    if outputs:
+        return Answer(Status.PARTIAL_OUTPUT, f"refused, but left {', '.join(outputs)}", code=code, seconds=end.seconds)
     return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=end.seconds)
 
 
@@ -134,12 +136,16 @@ def last_words(end: ProcessEnd) -> str:
     return f": {words[:_MESSAGE_MAX]}" if words else ""
 
 
-def _read_arrays(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool) -> Answer:
+def _read_arrays(outdir: Path, names: list[str], seconds: float, *, keep_floats: bool) -> Answer:
+    """Read the files `names` of an output folder: the header, and size and SHA-256 of each array.
+
+    A file of another name, or an unreadable header, is a wrong answer.
+    """
     header: dict[str, Any] = {}
     arrays, floats = {}, {}
-    for name in left:
+    for name in names:
         path = outdir / name
-        part, _, rest = name.partition(".")
+        part, _, file_name = name.partition(".")
         if name == "header.json":
             try:
                 header = json.loads(path.read_bytes(), parse_int=whole_number)
@@ -147,10 +153,10 @@ def _read_arrays(outdir: Path, left: list[str], seconds: float, *, keep_floats: 
                 header = {}
             if not isinstance(header, dict) or not header:
                 return Answer(Status.WRONG_ANSWER, "header.json is not a JSON object", seconds=seconds)
-        elif part in _PARTS and rest.endswith(".bin") and path.is_file():
+        elif part in _PARTS and file_name.endswith(".bin") and path.is_file():
             with path.open("rb") as stream:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            array = unquote(rest.removesuffix(".bin"))
+            array = unquote(file_name.removesuffix(".bin"))
             arrays[f"{part}.{array}"] = (path.stat().st_size, digest)
             if keep_floats and part == "floats":
                 floats[array] = path.read_bytes()
@@ -272,15 +278,18 @@ def _make_absolute(argument: str) -> str:
 
 
 def _absolute_path(path: str) -> str:
+    """Return the absolute path, with braces doubled for `str.format`."""
     # Do not resolve links: Python locates a virtual environment by the path of its executable.
     return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
 
 
 def _has_separator(path: str) -> bool:
+    """Return True if a path contains a slash, or a backslash on Windows."""
     return any(separator in path for separator in (os.sep, os.altsep) if separator)
 
 
 def _tail(stream: IO[bytes]) -> bytes:
+    """Return the last `_OUTPUT_MAX` bytes of a file."""
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(0, size - _OUTPUT_MAX))
     return stream.read()

@@ -37,8 +37,11 @@ _LEVEL = "L4"
 PSNR_CAP = 99.0
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_SIDE_MAX = 4096
-_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alpha, RGBA
+_SIDE_MAX = 4096  # pixels; bounds the memory for a foreign image
+_NONE, _SUB, _UP, _AVERAGE, _PAETH = range(5)  # filters of a row (PNG, section 9)
+_BIT_DEPTH = 8
+_RGB = 2  # colour type
+_CHANNELS = {0: 1, _RGB: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alpha, RGBA
 
 
 def can_render() -> bool:
@@ -83,15 +86,16 @@ def score_renderer(vector: Vector, command: str, timeout: float) -> list[Outcome
         command: command line with `{input}`, `{camera}` and `{out}` or `{outdir}`.
         timeout: time limit for each render, seconds.
     """
-    return [_score_view(vector, number, command, timeout) for number in range(len(vector.views))]
+    return [_run_and_score(vector, number, command, timeout) for number in range(len(vector.views))]
 
 
 def skip_views(vector: Vector, why: str) -> list[Outcome]:
     """Return a skipped outcome for each view, with the reason."""
-    return [_outcome(vector, number, Status.SKIPPED, why) for number in range(len(vector.views))]
+    return [_view_outcome(vector, number, Status.SKIPPED, why) for number in range(len(vector.views))]
 
 
-def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Outcome:
+def _run_and_score(vector: Vector, number: int, command: str, timeout: float) -> Outcome:
+    """Run the renderer on view `number` and compare its PNG; `timeout` in seconds. See `score_renderer`."""
     with temporary_folder() as folder:
         outdir, camera = folder / "out", folder / "camera.json"
         outdir.mkdir()
@@ -101,31 +105,37 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
         end = run_program(command, {key: str(path) for key, path in values.items()}, timeout)
         seconds = end.seconds
         if end.status is not None:
-            return _outcome(vector, number, end.status, end.message + last_words(end), seconds)
+            return _view_outcome(vector, number, end.status, end.message + last_words(end), seconds)
         if end.returncode:
-            return _outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(end)}", seconds)
+            return _view_outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(end)}", seconds)
         pngs = sorted(outdir.rglob("*.png"))
         if len(pngs) != 1:
             wrong = Status.WRONG_ANSWER if pngs else Status.NO_OUTPUT
-            return _outcome(vector, number, wrong, f"{len(pngs)} PNG files were written, expected one", seconds)
+            return _view_outcome(vector, number, wrong, f"{len(pngs)} PNG files were written, expected one", seconds)
         try:
             return _compare_render(vector, number, read_png(pngs[0].read_bytes()), seconds)
         except InputError as error:
-            return _outcome(vector, number, Status.WRONG_ANSWER, str(error), seconds)
+            return _view_outcome(vector, number, Status.WRONG_ANSWER, str(error), seconds)
 
 
 def _compare_render(vector: Vector, number: int, image: U8, seconds: float) -> Outcome:
+    """Compare a render, [H, W, 3], with the reference image of view `number`; `seconds` is the renderer's time.
+
+    Raises:
+        InputError: the images differ in size.
+    """
     view = vector.views[number]
     score = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
     passed = score >= view["psnr"]
     message = "" if passed else f"PSNR of {view['picture']} is {score:.1f} dB, expected {view['psnr']:g}"
     status = Status.PASSED if passed else Status.FAILED
-    return _outcome(vector, number, status, message, seconds, psnr=round(score, 2))
+    return _view_outcome(vector, number, status, message, seconds, psnr=round(score, 2))
 
 
-def _outcome(
+def _view_outcome(
     vector: Vector, number: int, status: Status, message: str, seconds: float = 0.0, **details: Any
 ) -> Outcome:
+    """Return the outcome of view `number`, named `vector#number`."""
     name = f"{vector.name}#{number}"
     return Outcome(name, _LEVEL, status, tuple(vector.clauses), "", message, seconds, details)
 
@@ -146,16 +156,17 @@ def psnr(reference: U8, image: U8) -> float:
 def write_png(image: U8) -> bytes:
     """Return a PNG of [H, W, 3] values."""
     height, width, _ = image.shape
-    before = np.zeros_like(image)
-    before[:, 1:] = image[:, :-1]
-    # Filter 1, "sub": the difference from the pixel to the left.
-    rows = np.concatenate([np.ones((height, 1), np.uint8), (image - before).reshape(height, -1)], axis=1)
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    left = np.zeros_like(image)
+    left[:, 1:] = image[:, :-1]
+    # The difference from the pixel to the left, modulo 256.
+    rows = np.concatenate([np.full((height, 1), _SUB, np.uint8), (image - left).reshape(height, -1)], axis=1)
+    head = struct.pack(">IIBBBBB", width, height, _BIT_DEPTH, _RGB, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b""))
     return _SIGNATURE + b"".join(_png_chunk(kind, data) for kind, data in chunks)
 
 
 def _png_chunk(kind: bytes, data: bytes) -> bytes:
+    """Return a chunk with its size and CRC."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
@@ -172,6 +183,7 @@ def read_png(data: bytes) -> U8:
 
 
 def _decode_png(data: bytes) -> U8:
+    """Decode a PNG as `read_png` does, without a check of CRCs; errors of truncated data are not translated."""
     if not data.startswith(_SIGNATURE):
         raise InputError("not a PNG")
     head, coded, at = b"", b"", len(_SIGNATURE)
@@ -182,7 +194,7 @@ def _decode_png(data: bytes) -> U8:
         coded += body if kind == b"IDAT" else b""
         at += 12 + size
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", head)
-    if depth != 8 or colour not in _CHANNELS or interlace:
+    if depth != _BIT_DEPTH or colour not in _CHANNELS or interlace:
         raise InputError(f"the PNG has {depth} bits, colour type {colour}, expected 8 bits, RGB, not interlaced")
     if not (1 <= width <= _SIDE_MAX and 1 <= height <= _SIDE_MAX):
         raise InputError(f"the PNG has {width}x{height} pixels, expected at most {_SIDE_MAX}x{_SIDE_MAX}")
@@ -194,18 +206,22 @@ def _decode_png(data: bytes) -> U8:
 
 
 def _undo_filters(rows: U8, channels: int) -> U8:
-    """Undo the filter of each row, [H, 1 + W * channels] (PNG, section 9)."""
+    """Undo the filter of each row, [H, 1 + W * channels], and return [H, W * channels] (PNG, section 9).
+
+    Raises:
+        InputError: a filter is unknown.
+    """
     out = np.zeros((len(rows), rows.shape[1] - 1), np.uint8)
     above = np.zeros(rows.shape[1] - 1, np.uint8)
     for y, (kind, *_) in enumerate(rows[:, :1].tolist()):
         line = rows[y, 1:]
-        if kind == 2:
+        if kind == _UP:
             out[y] = line + above
-        elif kind == 1:
+        elif kind == _SUB:
             out[y] = np.cumsum(line.reshape(-1, channels), axis=0, dtype=np.uint8).reshape(-1)
-        elif kind in (3, 4):
-            out[y] = _undo_row(line.tolist(), above.tolist(), channels, kind == 4)
-        elif kind == 0:
+        elif kind in (_AVERAGE, _PAETH):
+            out[y] = _undo_row(line.tolist(), above.tolist(), channels, kind == _PAETH)
+        elif kind == _NONE:
             out[y] = line
         else:
             raise InputError(f"row {y} of the PNG has filter {kind}, expected 0 to 4")
@@ -214,6 +230,7 @@ def _undo_filters(rows: U8, channels: int) -> U8:
 
 
 def _undo_row(line: list[int], above: list[int], channels: int, paeth: bool) -> list[int]:
+    """Undo the filter Paeth, or else Average, of a row, given the bytes of the row above; W * channels bytes each."""
     out: list[int] = []
     for i, value in enumerate(line):
         left = out[i - channels] if i >= channels else 0

@@ -69,6 +69,7 @@ def ulps_between(values: NDArray[np.float32], exact: NDArray[np.float32]) -> NDA
 
 
 def _ordinals(values: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Number the binary32 values in ascending order, so that neighbours differ by 1; +0 and -0 are 0."""
     magnitudes = np.abs(values).view(np.uint32).astype(np.int64)
     return np.where(np.signbit(values), -magnitudes, magnitudes)
 

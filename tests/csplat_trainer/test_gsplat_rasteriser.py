@@ -85,7 +85,7 @@ def test_masked_pixels_do_not_count():
 
 def test_images_are_kept_on_the_device_as_far_as_they_fit(image):
     images = DeviceImages(CPU)
-    images._left = 2000.0
+    images._bytes_left = 2000.0
     shown = images.reference(image, torch.ones(3))
     assert torch.equal(shown, images.reference(image, torch.ones(3)))
     assert 1 == len(images._kept)

@@ -169,7 +169,7 @@ def run_batch(
                         executor.shutdown()
                         executor, lost = new(), [*lost, task]
                     idle.append(executor)
-                    ended[task.output] = _result(future, task)
+                    ended[task.output] = _result_or_failure(future, task)
                     context.progress("scenes", len(ended) / len(tasks))
         finally:
             lost += [task for _, task in running.values()]
@@ -185,8 +185,12 @@ def run_batch(
     return done
 
 
-def _result(future: Future[SceneResult], task: Task) -> SceneResult:
-    """Return the result of a task, or its failure if its process was killed or its cluster gave up."""
+def _result_or_failure(future: Future[SceneResult], task: Task) -> SceneResult:
+    """Return the result of a task that ended; a failure if its process was killed, or for an unexpected error.
+
+    Raises:
+        CommandLineError: options of all scenes are invalid.
+    """
     try:
         return future.result()
     except CommandLineError:
@@ -214,23 +218,29 @@ def _end_processes(processes: Collection[Any], outputs: Sequence[Path]) -> None:
 @contextmanager
 def _interrupts_noted() -> Iterator[list[int]]:
     """Note interrupts in a list, and raise KeyboardInterrupt only at the end: callbacks and destructors swallow it."""
-    noted, before = list[int](), signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before in (None, signal.SIG_IGN):
+    noted = list[int]()  # numbers of the signals
+    handler = signal.getsignal(signal.SIGINT)
+    # Only the main thread can set a handler. None is a handler that was not set from Python, and cannot be restored.
+    if threading.current_thread() is not threading.main_thread() or handler in (None, signal.SIG_IGN):
         yield noted
         return
     signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
     try:
         yield noted
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
     if noted:
         raise KeyboardInterrupt
 
 
 def _begin_worker(context: Context) -> None:
-    """Prepare a worker process: it ends on request, or when this program was killed."""
+    """Prepare a worker process: it ignores interrupts, ends with its parent, and has the context's number of threads.
+
+    Sets NUMBA_NUM_THREADS unless it is set, and starts a thread that waits for the end of the parent.
+    """
 
     def end_with(parent: Any) -> None:
+        """Wait for the end of the parent, then ask this process to clean up, and end it after `_CLEANUP_SECONDS`."""
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(_CLEANUP_SECONDS)
@@ -253,9 +263,9 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
         raise CommandLineError(f"csplat {command[0]} writes several formats: choose one with --ending, such as .spz")
     path.stat()  # raises an OSError that names it
     if path.is_dir():
-        scenes = [(Task(str(path / name), ""), name) for name in _names(path, command[0], match, without)]
+        scenes = [(Task(str(path / name), ""), name) for name in _find_scenes(path, command[0], match, without)]
     elif path.suffix.lower() in _MANIFESTS:
-        scenes = list(_listed(path))
+        scenes = list(_read_manifest(path))
     else:
         raise InputError(f"{path} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
     if not scenes:
@@ -273,17 +283,22 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
     return tasks
 
 
-def _names(folder: Path, command: str, match: str, without: Path) -> list[str]:
-    """Return the relative paths of the scenes within a folder, with slashes."""
+def _find_scenes(folder: Path, command: str, match: str, without: Path) -> list[str]:
+    """Return the sorted relative paths, with slashes, of the scenes within a folder that suit a command.
+
+    Hidden files and folders, and files that lead into the folder `without`, are skipped. `match` is a shell pattern of
+    a path or of a name.
+    """
     endings = tuple(
         end for scene_format in formats() if scene_format.open for end in scene_format.suffixes if end.startswith(".")
     )
-    own, scenes, away = _COMMANDS[command][1], set[Path](), resolve_links(without)
+    takes_csplat = _COMMANDS[command][1]  # None: both kinds of files
+    scenes, excluded = set[Path](), resolve_links(without)
     for path in folder.rglob("*"):
         name, relative = path.name.lower(), path.relative_to(folder)
-        is_scene = (name in FOLDER_NAMES or name.endswith(endings)) and own in (None, name.endswith(".csplat"))
+        is_scene = (name in FOLDER_NAMES or name.endswith(endings)) and takes_csplat in (None, name.endswith(".csplat"))
         is_hidden = any(part.startswith(".") for part in relative.parts)
-        if is_scene and not (is_hidden or path.is_dir() or Path(os.path.realpath(path)).is_relative_to(away)):
+        if is_scene and not (is_hidden or path.is_dir() or Path(os.path.realpath(path)).is_relative_to(excluded)):
             scenes.add(relative)
     names = [scene.as_posix() for scene in sorted(scenes) if not _is_part(folder, scene, scenes)]
     return [name for name in names if fnmatch(name, match) or fnmatch(PurePosixPath(name).name, match)]
@@ -298,19 +313,28 @@ def _is_part(folder: Path, name: Path, names: set[Path]) -> bool:
     return name.name == _ONE_LEVEL and any(above / _LEVELS in names for above in name.parents)
 
 
-def _listed(manifest: Path) -> Iterator[tuple[Task, str]]:
-    """Yield the scenes of a manifest, with paths relative to its folder, and the paths that name their outputs."""
+def _read_manifest(manifest: Path) -> Iterator[tuple[Task, str]]:
+    """Yield the scenes of a manifest, with the relative paths that name outputs for which it has no name.
+
+    Paths of scenes are relative to its folder. Empty lines, comments and rows of column names yield nothing; such a row
+    sets the columns of those below.
+
+    Raises:
+        InputError: a line is invalid, or the file is not text.
+    """
     lines, is_json = read_text(manifest).splitlines(), manifest.suffix.lower() == ".jsonl"
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    separator = next((mark for mark in ";\t" if mark in first and "," not in first), ",")  # as some spreadsheets write
+    # Some spreadsheets write other separators; the first line with content shows which.
+    separator = "," if "," in first else next((mark for mark in ";\t" if mark in first), ",")
     columns = list(_COLUMNS)
     for number, line in enumerate(lines, 1):
         try:
             row = [line] if is_json else next(csv.reader([line], skipinitialspace=True, delimiter=separator))
             cells = [cell.strip() for cell in row]
-            heads = [cell.casefold() for cell in cells]
-            columns = heads if "path" in heads else columns  # a row of names
-            if "path" in heads or not any(cells) or cells[0].startswith(("#", "sep=")):
+            folded = [cell.casefold() for cell in cells]
+            is_heading = "path" in folded
+            columns = folded if is_heading else columns
+            if is_heading or not any(cells) or cells[0].startswith(("#", "sep=")):
                 continue
             fields = parse_json(line) if is_json else dict(zip(columns, cells, strict=False))
             source, output, options = (fields.get(name) or "" for name in _COLUMNS)
@@ -349,7 +373,7 @@ def run_scene(
     """
     result, is_remote = SceneResult(task.source, task.output), is_url(task.source) or is_url(task.output)
     try:
-        with _local(task.source, Path()) as source, _local(task.output, folder) as output:
+        with _local_file(task.source, Path()) as source, _local_file(task.output, folder) as output:
             result = replace(result, source_bytes=size_on_disk(source))
             if output.exists() and not force:
                 splats = _check_existing(output, None if is_remote else source)
@@ -389,10 +413,17 @@ def run_scene(
 
 
 def _run_here(words: list[str]) -> tuple[int, str, str]:
-    """Run a command line in this process; return its status and what it printed on standard output and error."""
+    """Run a command line in this process; return its status and what it printed on standard output and error.
+
+    Replaces `sys.argv`, both streams and the handler of SIGTERM meanwhile.
+
+    Raises:
+        SystemExit: the process has to end, as requested by SIGTERM.
+    """
     [program] = entry_points(group="console_scripts", name="csplat")
-    out, err, status, arguments = StringIO(), StringIO(), 0, sys.argv
-    sys.argv, before = ["csplat", *words], signal.signal(signal.SIGTERM, _end)
+    out, err, status = StringIO(), StringIO(), 0
+    arguments, handler = sys.argv, signal.signal(signal.SIGTERM, _end_worker)
+    sys.argv = ["csplat", *words]
     try:
         with redirect_stdout(out), redirect_stderr(err):
             program.load()()
@@ -401,19 +432,24 @@ def _run_here(words: list[str]) -> tuple[int, str, str]:
         if status == _STATUS_ENDED:
             raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, handler)
         sys.argv = arguments
     return status, out.getvalue(), err.getvalue()
 
 
-def _end(*_: object) -> None:
+def _end_worker(*_: object) -> None:
+    """Handle SIGTERM in a worker: kill its processes, and raise SystemExit."""
     for process in multiprocessing.active_children():
         process.kill()
     sys.exit(_STATUS_ENDED)  # removes unfinished files
 
 
 def _check_existing(output: Path, source: Path | None) -> int | None:
-    """Return the number of splats of an output, if it is a scene. Its source is `None` if its age is not known.
+    """Return the number of splats of an output that need not be made again; `None` for another kind of file.
+
+    Args:
+        output: a file or folder that exists.
+        source: its scene; `None`: ages cannot be compared.
 
     Raises:
         InputError: the output is damaged, or older than its source.
@@ -436,8 +472,20 @@ def _check_existing(output: Path, source: Path | None) -> int | None:
 
 
 @contextmanager
-def _local(place: str, folder: Path) -> Iterator[Path]:
-    """Yield the path of a file. A file at a URL is downloaded if it exists, and uploaded if it was replaced."""
+def _local_file(place: str, folder: Path) -> Iterator[Path]:
+    """Yield the local path of a file; a file at a URL has a temporary copy.
+
+    A file at a URL is downloaded if it exists, and uploaded at the end if the copy was made or replaced, but not if it
+    was only changed in place.
+
+    Args:
+        place: a URL, or a path.
+        folder: folder of a relative path.
+
+    Raises:
+        InputError: the package for URLs is not installed.
+        OSError: the file cannot be transferred.
+    """
     if not is_url(place):
         yield folder / place
         return
@@ -450,9 +498,9 @@ def _local(place: str, folder: Path) -> Iterator[Path]:
         local = temporary / PurePosixPath(path).name
         if files.exists(path):
             files.get_file(path, str(local))
-        before = local.exists() and local.stat().st_ino
+        downloaded_inode = local.stat().st_ino if local.exists() else None
         yield local
-        if local.exists() and local.stat().st_ino != before:
+        if local.exists() and local.stat().st_ino != downloaded_inode:
             files.put_file(str(local), path)
 
 

@@ -86,7 +86,7 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
     Yields:
         The progress callback, `null_progress` if nothing is shown.
     """
-    with _displayed(quiet=quiet) as display:
+    with _ticking_display(quiet=quiet) as display:
         yield null_progress if display is None else display.report
 
 
@@ -117,7 +117,7 @@ def step_progress(
         if display is not None:
             display.report(name, now.iteration / now.iterations, describe(now))
 
-    with _displayed(quiet=quiet) as display:
+    with _ticking_display(quiet=quiet) as display:
         yield None if display is None else show
 
 
@@ -185,7 +185,7 @@ class Display:
             self._bars, self._tasks = None, {}
 
     def _update_bars(self, unfinished: Sequence[tuple[str, _Stage]], now: float) -> None:
-        """Update the bars, and remove the bars of stages that ended."""
+        """Show and update a bar for each unfinished stage, by name, and remove the others; `now` is in seconds."""
         if self._bars is None:
             self._bars = _new_bars()
             self._bars.start()
@@ -253,7 +253,12 @@ def displayed(display: Display) -> Iterator[Display]:
 
 
 @contextmanager
-def _displayed(*, quiet: bool) -> Iterator[Display | None]:
+def _ticking_display(*, quiet: bool) -> Iterator[Display | None]:
+    """Show a display that a thread updates every `_TICK` seconds, unless one is shown already, which is yielded then.
+
+    Yields:
+        The display; `None` if `quiet`.
+    """
     if quiet:
         yield None
         return
@@ -265,6 +270,7 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
     with displayed(Display(terminal=sys.stderr.isatty())) as display:
 
         def tick() -> None:
+            """Update the display until the context ends."""
             while not ended.wait(_TICK):
                 display.tick()
 
@@ -278,7 +284,10 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
 
 
 def _stage_text(stage: _Stage, now: float) -> str:
-    """Return the percentage of a stage that is done, and an estimate of the time left."""
+    """Return the text of a stage: its own, or the percentage that is done, with an estimate of the time left.
+
+    The estimate is left out early in a stage, and the percentage before any progress. `now` is in seconds, as `begun`.
+    """
     if stage.text is not None:
         return stage.text
     if stage.done <= 0.0:
@@ -307,6 +316,11 @@ _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) i
 
 
 def _echo(text: str, stream: TextIO) -> None:
+    """Write a line after hiding bars, with escapes for control characters and those that the encoding lacks.
+
+    Raises:
+        OSError: the stream cannot be written.
+    """
     for display in _displays:
         display.hide_bars()  # bars and lines on one terminal do not mix
     text = text.translate(_CONTROLS)

@@ -29,6 +29,10 @@ from csplat_tools.scene_files import MetadataOverrides, findings_as_json, with_p
 
 _CELL = 0.01  # radius of a splat's neighbourhood, as a fraction of the scene's extent
 _SPREAD = 4.0  # the same in standard deviations of the splat, used if it is larger
+_OCTAVES_MAX = 40.0  # doublings of the cell for larger splats, so that its size stays finite
+_CELLS_MAX = 2.0**19  # cells from the corner of the scene; splats beyond share the last cell
+_KEY_BITS = 21  # bits of a cell along one axis in the key of the cell
+_LOG_SIZE_MAX = 80.0  # log scales are clipped to plus or minus this, so that their exponentials are finite in float32
 _NEIGHBOURS_MIN = 8  # splats in the neighbourhood, including itself; a splat with fewer is a floater
 
 
@@ -67,7 +71,7 @@ class Filters:
         letters = scene.metadata.coordinate_system
         turn = np.eye(3) if self.axes is None or self.axes == letters else axes_rotation(self.axes, letters)
         if self.rotate is not None:
-            matrix = turn @ _rotation(self.rotate) @ turn.T
+            matrix = turn @ _rotation_matrix(self.rotate) @ turn.T
             scene = scene.map(lambda model: _rotate_in_axes(model, matrix))
         if self.scale is not None:
             factor = self.scale
@@ -77,10 +81,10 @@ class Filters:
             scene = scene.map(lambda model: translate_scene(model, (x, y, z)))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3) @ turn.T, axis=0)
-            scene = _select(scene, lambda model: _inside_box(model, corners))
+            scene = _select_splats(scene, lambda model: _inside_box(model, corners))
         if self.crop_sphere is not None:
             sphere = np.array([*(turn @ self.crop_sphere[:3]), self.crop_sphere[3]])
-            scene = _select(scene, lambda model: _inside_sphere(model, sphere))
+            scene = _select_splats(scene, lambda model: _inside_sphere(model, sphere))
         if self.drop_floaters:
             scene = _without_floaters(scene)
         if self.sh_degree is not None:
@@ -118,29 +122,34 @@ def find_floaters(points: F64, sizes: F64) -> Mask:
         return np.zeros(len(points), np.bool_)
     with np.errstate(divide="ignore", over="ignore"):
         octaves = np.ceil(np.log2(np.maximum(_SPREAD * sizes / (_CELL * extent), 1.0)))
-    octaves = np.minimum(octaves, 40.0).astype(np.int64)
+    octaves = np.minimum(octaves, _OCTAVES_MAX).astype(np.int64)
     floaters = np.zeros(len(points), np.bool_)
     for octave in np.unique(octaves):
-        cells = np.floor(np.clip((points - low) / (_CELL * extent * 2.0**octave), -(2.0**19), 2.0**19)).astype(np.int64)
-        keys, counts = np.unique(_key(cells), return_counts=True)
+        places = (points - low) / (_CELL * extent * 2.0**octave)
+        cells = np.floor(np.clip(places, -_CELLS_MAX, _CELLS_MAX)).astype(np.int64)
+        keys, counts = np.unique(_cell_keys(cells), return_counts=True)
         own = np.flatnonzero(octaves == octave)
         neighbours = np.zeros(len(own), np.int64)
         for step in np.ndindex(3, 3, 3):
-            expected = _key(cells[own] + (np.array(step) - 1))
+            expected = _cell_keys(cells[own] + (np.array(step) - 1))
             at = np.minimum(np.searchsorted(keys, expected), len(keys) - 1)
             neighbours += np.where(keys[at] == expected, counts[at], 0)
         floaters[own] = neighbours < _NEIGHBOURS_MIN
     return floaters
 
 
-def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    x, y, z = (cells[:, k] + (1 << 20) for k in range(3))
-    key: NDArray[np.int64] = (x << 42) | (y << 21) | z
+def _cell_keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return one integer for each cell, [N], from its three, [N, 3], whose absolute values are below 2**20."""
+    x, y, z = (cells[:, k] + (1 << (_KEY_BITS - 1)) for k in range(3))
+    key: NDArray[np.int64] = (x << (2 * _KEY_BITS)) | (y << _KEY_BITS) | z
     return key
 
 
-def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
+def _select_splats(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
+    """Return a scene of the splats that `keep` marks in each block. Reads the scene once, to count them."""
+
     def blocks() -> Iterator[SplatModel]:
+        """Yield the kept splats, without empty blocks."""
         for model in scene.blocks():
             kept = keep(model)
             if kept.any():
@@ -151,40 +160,44 @@ def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
 
 
 def _without_floaters(scene: Scene) -> Scene:
-    """Drop isolated splats. Centres and sizes of all splats are kept in memory, 16 bytes each."""
+    """Return a scene without isolated splats. Reads the scene once; 16 bytes of each splat are kept in memory."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
-    at = 0
+    start = 0
     for model in scene.blocks():
-        part = slice(at, at + len(model))
-        points[part], sizes[part] = model.means, np.exp(np.clip(model.scales.max(axis=1), -80.0, 80.0))
-        at += len(model)
-    floats = find_floaters(points.astype(np.float64), sizes.astype(np.float64))
+        part = slice(start, start + len(model))
+        log_sizes = np.clip(model.scales.max(axis=1), -_LOG_SIZE_MAX, _LOG_SIZE_MAX)
+        points[part], sizes[part] = model.means, np.exp(log_sizes)
+        start += len(model)
+    is_floater = find_floaters(points.astype(np.float64), sizes.astype(np.float64))
 
     def blocks() -> Iterator[SplatModel]:
-        at = 0
+        """Yield the other splats, without empty blocks."""
+        start = 0
         for model in scene.blocks():
-            kept = ~floats[at : at + len(model)]
-            at += len(model)
-            if kept.any():
-                yield model.select(kept)
+            is_kept = ~is_floater[start : start + len(model)]
+            start += len(model)
+            if is_kept.any():
+                yield model.select(is_kept)
 
-    return scene.changed(count=scene.count - int(np.count_nonzero(floats)), reader=blocks)
+    return scene.changed(count=scene.count - int(np.count_nonzero(is_floater)), reader=blocks)
 
 
 def _inside_box(model: SplatModel, corners: F64) -> Mask:
-    """Return which centres lie between two corners, [2, 3], the lower corner first."""
+    """Return True, [N], for centres within two corners, [2, 3] in world coordinates, the lower corner first."""
     places = model.means + np.array(model.origin)
     inside: Mask = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
     return inside
 
 
 def _inside_sphere(model: SplatModel, sphere: F64) -> Mask:
+    """Return True, [N], for centres within a sphere, [4]: its centre in world coordinates, and its radius."""
     places = model.means + np.array(model.origin)
     inside: Mask = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
     return inside
 
 
-def _rotation(degrees: tuple[float, float, float]) -> F64:
+def _rotation_matrix(degrees: tuple[float, float, float]) -> F64:
+    """Return the matrix, [3, 3], of rotations about the fixed axes x, y and z, in this order, counterclockwise."""
     matrix = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
         turn = np.eye(3)

@@ -174,7 +174,7 @@ def encode_file(
 
 
 def _levels_of_source(local: Path, builder: FittedLevelBuilder, context: Context) -> FittedLevelBuilder:
-    """Return the builder that takes the levels of streamed SOG.
+    """Return the builder that takes the levels of streamed SOG, which is read from the path `local`.
 
     Raises:
         InputError: the scene does not fit in memory; or as in `choose_levels`.
@@ -190,7 +190,14 @@ def _levels_of_source(local: Path, builder: FittedLevelBuilder, context: Context
 def _encode_on_disk(
     scene: Scene, output: str, options: EncodeOptions, levels: FittedLevelBuilder | None, context: Context
 ) -> EncodeResult:
-    """Encode an opened scene without reading it into memory, and write the .csplat file."""
+    """Encode an opened scene without reading it into memory, and write the .csplat file.
+
+    If it is interrupted or the disk is full, the finished part is kept, and a note tells how to resume.
+
+    Raises:
+        InputError: the output is standard output, or an option cannot be used.
+        OSError: a file cannot be read or written.
+    """
     if output == STANDARD_STREAM:
         raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
     try:

@@ -207,7 +207,7 @@ def source_path(file: File) -> Iterator[Path]:
     """
     with local_path(file) as local:
         if is_csplat(local):
-            _refuse_others(local)
+            _refuse_other_formats(local)
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` converts it to a PLY,"
                 " `csplat info` describes it"
@@ -245,11 +245,11 @@ def mapped_csplat(path: str, shown: str | None = None) -> Iterator[bytes | mmap]
     with naming(path if shown is None else shown), kept_path(path) as local:
         data = map_file(local)
         try:
-            _refuse_others(local, path if shown is None else shown)
+            _refuse_other_formats(local, path if shown is None else shown)
             yield data
         finally:
             if isinstance(data, mmap):
-                _close(data)
+                _close_map(data)
 
 
 def csplat_file(path: str) -> File:
@@ -261,10 +261,10 @@ def csplat_file(path: str) -> File:
     """
     if path == STANDARD_STREAM or (not is_url(path) and Path(path).is_fifo()):
         with naming(path), kept_path(path) as local:
-            _refuse_others(local, path)
+            _refuse_other_formats(local, path)
             return _Spooled(read_bytes(local), STANDARD_INPUT if path == STANDARD_STREAM else path)
     if not is_url(path) and Path(path).is_file():
-        _refuse_others(Path(path))
+        _refuse_other_formats(Path(path))
     return path
 
 
@@ -342,14 +342,20 @@ def is_one_way(path: str) -> bool:
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
-def _refuse_others(path: Path, shown: str = "") -> None:
+def _refuse_other_formats(path: Path, shown: str = "") -> None:
+    """Refuse a file of a known format other than .csplat; `shown` is its name in the message, or `-`.
+
+    Raises:
+        InputError: it has another format, which the message names.
+    """
     head = read_head(path)
     kind = detect_content(path, head) or detect_name(path)
     if kind is not None and kind.name != "csplat":
         raise refusal(path, head, wanted="csplat", shown=STANDARD_INPUT if shown == STANDARD_STREAM else shown)
 
 
-def _close(data: mmap) -> None:
+def _close_map(data: mmap) -> None:
+    """Close a map, now or, if something still refers to its data, later."""
     try:
         data.close()
     except BufferError:

@@ -307,22 +307,29 @@ def draw_svg(draw: Callable[[Figure], None], size: tuple[float, float], name: st
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         canvas.savefig(buffer, format="svg", metadata=nothing, transparent=True)
     root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
-    _clean(root, name)
+    _make_embeddable(root, name)
     return ET.tostring(root, encoding="unicode").replace(INK, "currentColor")
 
 
-def _clean(root: ET.Element, name: str) -> None:
-    """Turn styles into attributes, and prefix ids with the plot's name."""
+def _make_embeddable(root: ET.Element, name: str) -> None:
+    """Turn styles into attributes, and prefix ids with the plot's name, so that several plots can share a page.
+
+    Changes the SVG in place: it loses its namespaces, style elements, width and height, and gets the role of an image.
+
+    Args:
+        root: the `svg` element as matplotlib writes it.
+        name: name of the plot, unique in the page.
+    """
     for element in list(root.iter()):
         element.tag = element.tag.removeprefix(_SVG)
         for child in list(element):
             if child.tag == f"{_SVG}style":
                 element.remove(child)
-        attributes = {**_as_attributes(element.attrib.pop("style", "")), **element.attrib}
+        attributes = {**_parse_style(element.attrib.pop("style", "")), **element.attrib}
         element.attrib.clear()
         for key, value in attributes.items():
             plain = "href" if key == f"{_XLINK}href" else key
-            element.set(plain, _own_id(plain, value, name))
+            element.set(plain, _prefix_ids(plain, value, name))
     del root.attrib["height"], root.attrib["width"]
     # The content of matplotlib's own style element, for this SVG alone.
     root.set("stroke-linejoin", "round")
@@ -331,7 +338,8 @@ def _clean(root: ET.Element, name: str) -> None:
     root.set("xmlns", _SVG.strip("{}"))
 
 
-def _own_id(key: str, value: str, name: str) -> str:
+def _prefix_ids(key: str, value: str, name: str) -> str:
+    """Return an attribute's value with the plot's name before an id, which it defines or refers to."""
     if key == "id":
         return f"{name}-{value}"
     if key == "href":
@@ -339,8 +347,8 @@ def _own_id(key: str, value: str, name: str) -> str:
     return value.replace("url(#", f"url(#{name}-")
 
 
-def _as_attributes(style: str) -> dict[str, str]:
-    """Parse `fill: none; stroke: red` into attributes, without the font family, which the page sets."""
+def _parse_style(style: str) -> dict[str, str]:
+    """Parse `fill: none; stroke: red` into attributes; of fonts only the size, since the page sets the family."""
     attributes: dict[str, str] = {}
     for part in style.split(";"):
         key, _, value = (piece.strip() for piece in part.partition(":"))
@@ -450,15 +458,18 @@ def _window_sums(values: F64, height: int, width: int) -> F64:
 
 
 def _framed(image: F32, rows: slice, columns: slice) -> U8:
-    """Return the whole view, [H, W, 3], reduced, with a frame that is visible on any background."""
+    """Return the whole view, [H, W, 3] in 0..1, reduced, with a frame that is visible on any background.
+
+    The frame runs inside the edge of the piece at `rows` and `columns`, which are in pixels of the view.
+    """
     shown = _reduced(to_uint8(image)).copy()
     factor = shown.shape[0] / image.shape[0]
-    top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
-    for inset, value in ((0, 0), (1, 255), (2, 0)):
-        edge = np.zeros(shown.shape[:2], bool)
-        edge[top + inset : bottom - inset, left + inset : right - inset] = True
-        edge[top + inset + 1 : bottom - inset - 1, left + inset + 1 : right - inset - 1] = False
-        shown[edge] = value
+    top, bottom, left, right = (round(factor * edge) for edge in (rows.start, rows.stop, columns.start, columns.stop))
+    for inset, value in enumerate((0, 255, 0)):  # black, white and black lines of one pixel, from outside
+        line = np.zeros(shown.shape[:2], bool)
+        line[top + inset : bottom - inset, left + inset : right - inset] = True
+        line[top + inset + 1 : bottom - inset - 1, left + inset + 1 : right - inset - 1] = False
+        shown[line] = value
     return shown
 
 
@@ -473,6 +484,7 @@ def _data_uri(pixels: U8) -> str:
 
 
 def _reduced(pixels: U8) -> U8:
+    """Return an image, [H, W, 3], with sides of at most `_SIDE` pixels in the same proportion; unchanged if smaller."""
     from PIL import Image
 
     height, width = pixels.shape[:2]

@@ -98,9 +98,9 @@ def encode_by_importance(
     if not len(rows):
         raise InputError(f"{path}: no view saw any splat, so all would be pruned")
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
-    left = weights.select(rows) if isinstance(weights, Importance) else None
+    kept_weights = weights.select(rows) if isinstance(weights, Importance) else None
     origin = Origin(len(model), rows)
-    plan = EncodePlan.of(model.select(rows), options, importance=left, origin=origin, context=context)
+    plan = EncodePlan.of(model.select(rows), options, importance=kept_weights, origin=origin, context=context)
     result = encode_planned(plan, levels, {"pruned": pruned})
     if stored.missed_share > 0.0:  # NaN if no view was held out
         missed = f"{100 * stored.missed_share:.1f} % of the splats were pruned although held-out views saw them:"
@@ -109,10 +109,12 @@ def encode_by_importance(
 
 
 def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
+    """Return a note if several quantisation classes are requested, and the importance lacks blocks to sort by."""
     if (options.max_classes or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
     return (_ONE_CLASS,)
 
 
 def _with_notes(result: EncodeResult, *notes: str) -> EncodeResult:
+    """Return a result with notes added to its report."""
     return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))

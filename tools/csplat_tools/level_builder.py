@@ -43,6 +43,7 @@ _KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
 # Seconds per splat to build levels and measure their errors: scenes in one piece, and buckets.
 _SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
+_ROUNDING = 1e-9  # more than the rounding error of a logarithm, so that an exact power needs no further level
 
 #: A function that makes the splats of a level, and the node of each. Its arguments are as for `LevelFitter.fit`.
 _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
@@ -117,13 +118,13 @@ class FittedLevelBuilder:
             part = self.build_part(model.select(rows), len(model), silent)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
-            nodes += [_moved(node, len(nodes), rows) for node in part]
+            nodes += [_renumber(node, len(nodes), rows) for node in part]
             context.progress("building levels", (done + 1) / len(buckets))
         parents, top = self.build_top(roots, context)
         for own, parent in zip(numbers, parents, strict=False):
             for number in own:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
-        return nodes + [_moved(node, len(nodes)) for node in top]
+        return nodes + [_renumber(node, len(nodes)) for node in top]
 
     def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
@@ -137,7 +138,7 @@ class FittedLevelBuilder:
 
         fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, context=context)
         return self._build_leaves(
-            splats, fitter.fit if scene_count <= self.fitted_splats else _merge, self._part_levels
+            splats, fitter.fit if scene_count <= self.fitted_splats else _merge_only, self._part_levels
         )
 
     def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
@@ -173,10 +174,11 @@ class FittedLevelBuilder:
     def _part_levels(self) -> int:
         """Number of levels above 0 with which the largest bucket becomes one node."""
         leaves = max(1, math.ceil(self.bucket_splats / self.leaf_splats))
-        levels = math.ceil(math.log(leaves, _CHILDREN) - 1e-9) or 1
+        levels = math.ceil(math.log(leaves, _CHILDREN) - _ROUNDING) or 1
         return levels if self.count is None else min(levels, self.count)
 
     def _build_leaves(self, splats: SplatModel, fit: _Fit, last: int | None) -> list[LevelNode]:
+        """Return leaves of about `leaf_splats` splats each, then the nodes of coarser levels; as `_add_levels`."""
         groups = kd_groups(splats.means, math.ceil(len(splats) / self.leaf_splats))
         places = np.empty(len(splats), np.int64)
         for place, rows in enumerate(groups):
@@ -196,14 +198,14 @@ class FittedLevelBuilder:
             fit: makes the splats of a level from the next finer level, as `LevelFitter.fit`.
             last: the coarsest level; `None`: the first level with a single node of at most `root_splats`.
         """
-        nodes, first, node_count = list(nodes), nodes[0].level, len(nodes)
-        level = first
+        nodes, node_count = list(nodes), len(nodes)  # node_count: of the coarsest level so far
+        level = first = nodes[0].level
         while (node_count > 1 or len(splats) > self.root_splats) if last is None else level < last:
             level += 1
             start = len(nodes)
             for child in range(node_count):
-                at = start - node_count + child
-                nodes[at] = replace(nodes[at], parent=start + child // _CHILDREN)
+                index = start - node_count + child
+                nodes[index] = replace(nodes[index], parent=start + child // _CHILDREN)
             node_count, places = math.ceil(node_count / _CHILDREN), places // _CHILDREN
             count = max(node_count, math.ceil(len(splats) / _KEPT))
             places, splats = fit(splats, places, count, level - first)
@@ -260,17 +262,19 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
     return np.split(order, np.cumsum(sizes)[:-1])
 
 
-def _merge(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
+def _merge_only(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
+    """Make the splats of a level as `LevelFitter.fit` does, by merging alone."""
     from csplat_tools.level_merging import merge_neighbours
 
     return merge_neighbours(finer, nodes, count)
 
 
 def _plain(model: SplatModel) -> SplatModel:
+    """Return the splats without extra columns and means in double precision."""
     return replace(model, extra={}, means_double=None)
 
 
-def _moved(node: LevelNode, first: int, rows: NDArray[np.intp] | None = None) -> LevelNode:
+def _renumber(node: LevelNode, first: int, rows: NDArray[np.intp] | None = None) -> LevelNode:
     """Raise the number of a node's parent by `first`, and look its rows up in `rows` [N], the rows of its part."""
     parent = None if node.parent is None else node.parent + first
     return replace(node, parent=parent, rows=None if node.rows is None or rows is None else rows[node.rows])

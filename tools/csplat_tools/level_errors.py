@@ -33,6 +33,7 @@ _IMAGE_PIXELS = 3 * _RADIUS_PIXELS
 _SIZES = _RADIUS_PIXELS.bit_length()  # pixel sizes of 1 to 256 pixels of the images
 _SQUARED_ERROR_MAX = 1e-3  # 30 dB
 _COVERED = 1.0 / 255.0  # alpha
+_NEAR_RADII = 1e-3  # radii from a camera to its near plane
 _DIRECTIONS = [(axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
 
 
@@ -63,7 +64,7 @@ def measure_errors(
         regions[number] = np.min(corners, axis=0), np.max(corners, axis=0)
         if node.level == 0 or node.squares:
             continue
-        cut = _reference(nodes, children, number, reference_splats)
+        cut = _reference_cut(nodes, children, number, reference_splats)
         coarse, fine = decode(encoded.part([node])), decode(encoded.part([nodes[index] for index in cut]))
         radius = _radius(regions[number], fine)
         try:
@@ -72,16 +73,27 @@ def measure_errors(
             squares = np.ones(_SIZES)
         below = _errors_below([(nodes[index], _radius(regions[index])) for index in cut], radius)
         squares = (np.sqrt(squares) + np.sqrt(below)) ** 2
-        error = max(_first_alike(squares, radius), *(nodes[child].error for child in children[number]))
+        error = max(_least_alike_size(squares, radius), *(nodes[child].error for child in children[number]))
         nodes[number] = replace(node, error=error, squares=tuple(squares.tolist()))
         context.progress("measuring levels", (number + 1) / len(nodes))
     return replace(encoded, nodes=nodes)
 
 
-def _reference(
+def _reference_cut(
     nodes: Sequence[FileNode], children: Sequence[Sequence[int]], number: int, splat_count: int
 ) -> list[int]:
-    """Return the nodes of a subtree's finest level with at most `splat_count` splats, else of its coarsest level."""
+    """Return the nodes of the level of a subtree with which its root is compared.
+
+    Args:
+        nodes: all nodes.
+        children: indices of the children of each node.
+        number: index of the root, above level 0.
+        splat_count: maximum number of splats.
+
+    Returns:
+        Indices of the nodes of the finest level with at most this number of splats, or else of the level below the
+        root. A branch that has no node of the level is represented by its next finer nodes.
+    """
     cut: list[int] = []
     for level in range(nodes[number].level):
         pending, cut = list(reversed(children[number])), []
@@ -103,28 +115,49 @@ def _radius(region: F64, splats: SplatModel | None = None) -> float:
 
 
 def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
-    """Return the squared errors of a level of a subtree, [sizes], at the pixel sizes of a node of this radius.
+    """Return the squared errors of a level of a subtree, [_SIZES], at the pixel sizes of a node of this radius.
 
     They are averages over the nodes, weighted by the areas of their regions. The error of a node is its error at the
-    next finer size that was measured.
+    next finer size that was measured; 0 for a node of level 0, and if all regions are points.
+
+    Args:
+        cut: the nodes of the level, and the radius of each, scene units.
+        radius: radius of the root, scene units.
     """
     total, area = np.zeros(_SIZES), 0.0
-    for node, own in cut:
-        area += own * own
-        if node.squares and own:
-            finer = np.arange(_SIZES) + math.floor(math.log2(radius / own))
-            total += own * own * np.array(node.squares)[np.clip(finer, 0, _SIZES - 1)]
+    for node, node_radius in cut:
+        area += node_radius * node_radius
+        if node.squares and node_radius:
+            finer = np.arange(_SIZES) + math.floor(math.log2(radius / node_radius))
+            total += node_radius * node_radius * np.array(node.squares)[np.clip(finer, 0, _SIZES - 1)]
     return total / area if area else total
 
 
-def _first_alike(squares: F64, radius: float) -> float:
-    """Return the smallest pixel size, scene units, from which on all squared errors, [sizes], are small, as float32."""
-    first = _SIZES - int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
+def _least_alike_size(squares: F64, radius: float) -> float:
+    """Return the smallest pixel size, scene units, from which on all squared errors, [_SIZES], are small, as float32.
+
+    If none is small at the coarsest size, that is the next coarser one.
+    """
+    # The number of small errors at the coarse end: the index of the first False, after which one always follows.
+    alike_count = int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
+    first = _SIZES - alike_count
     return float(np.float32(radius * 2.0**first / _RADIUS_PIXELS))
 
 
 def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel, centre: F64, radius: float) -> F64:
-    """Return the mean squared error at each pixel size, finest first, [_SIZES]."""
+    """Return the mean squared error of two models in six views at each pixel size, finest first, [_SIZES].
+
+    The mean is over red, green, blue and alpha of the pixels that either model covers; 0 if none is covered.
+
+    Args:
+        rasteriser: renders both.
+        coarse, fine: the models.
+        centre: [3], scene units.
+        radius: scene units, above 0.
+
+    Raises:
+        LimitError: too many splats at one place to be rendered.
+    """
     squares, pixels = np.zeros(_SIZES), np.zeros(_SIZES, np.int64)
     for camera in _cameras(centre, radius):
         a, b = (_image(rasteriser, splats, camera) for splats in (coarse, fine))
@@ -133,9 +166,9 @@ def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel
         for size in range(_SIZES):
             covered = np.maximum(images[4], images[5]) >= np.float32(_COVERED)
             error = np.einsum("cyx,cyx->yx", images[:4], images[:4])
-            squares[size] += float(np.sum(error[covered], dtype=np.float64)) / 4.0
+            squares[size] += float(np.sum(error[covered], dtype=np.float64)) / 4.0  # channels
             pixels[size] += int(covered.sum())
-            images = _halved(images)
+            images = _halved(images)  # for the next coarser size
     return squares / np.maximum(pixels, 1)
 
 
@@ -153,6 +186,7 @@ def _halved(images: F32) -> F32:
 
 
 def _cameras(centre: F64, radius: float) -> list[Camera]:
+    """Return a camera in each direction of the axes that looks at the centre, [3], of a node of this radius."""
     focal, middle = _DISTANCE * _RADIUS_PIXELS, _IMAGE_PIXELS / 2.0
     K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
     cameras = []
@@ -160,5 +194,5 @@ def _cameras(centre: F64, radius: float) -> list[Camera]:
         away = np.zeros(3)
         away[axis] = sign * _DISTANCE * radius
         up = np.eye(3)[(axis + 1) % 3]
-        cameras.append(look_at(centre + away, centre, up, K, _IMAGE_PIXELS, _IMAGE_PIXELS, near=radius * 1e-3))
+        cameras.append(look_at(centre + away, centre, up, K, _IMAGE_PIXELS, _IMAGE_PIXELS, near=radius * _NEAR_RADII))
     return cameras

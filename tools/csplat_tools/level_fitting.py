@@ -89,13 +89,18 @@ class LevelFitter:
             return merge_neighbours(finer, nodes, count)
 
     def _fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
+        """Fit a level as `fit` does. The refit is discarded if it makes held-out views worse.
+
+        Raises:
+            LimitError: a view has too many splats to be rendered.
+        """
         used, check = self._cameras(len(finer), level)
         if self.is_part:
             nodes, chosen = merge_neighbours(finer, nodes, count)
         else:
-            rows = self._choose(finer, nodes, count, used)
+            rows = self._choose_rows(finer, nodes, count, used)
             nodes, chosen = nodes[rows], finer.select(rows)
-        steps = _between(self.work.splats_to_move / len(chosen), self.work.steps)
+        steps = _clip_rounded(self.work.splats_to_move / len(chosen), self.work.steps)
         draw = renderer(self.scene, (0.0, 0.0, 0.0), context=self.context)
         renders = [draw(camera).rgb for camera in used]
         fitted = refit_splats(chosen, used, renders, steps=steps, moves=True, context=self.context)
@@ -103,16 +108,24 @@ class LevelFitter:
         return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
 
     def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:
-        """Return views for a level, and held-out views."""
-        widest = _between(math.sqrt(_PIXELS_PER_SPLAT * len(self.scene) / 3.0), _WIDTHS)
+        """Return views for a level, half as wide for each coarser one, and `HELD_OUT_COUNT` or fewer held-out views."""
+        widest = _clip_rounded(math.sqrt(_PIXELS_PER_SPLAT * len(self.scene) / 3.0), _WIDTHS)
         width = max(_LEAST_WIDTH, widest >> (level - 1))
-        views = _between(self.work.splats_to_measure / finer_count, self.work.views)
+        views = _clip_rounded(self.work.splats_to_measure / finer_count, self.work.views)
         checks = min(views // _CHECKS_EVERY, HELD_OUT_COUNT)
         place = cameras_outside if self.is_part else camera_sequence
         cameras = place(self.scene, views + checks, (width, width * 3 // 4))
         return cameras[checks:], cameras[:checks]
 
-    def _choose(self, finer: SplatModel, nodes: I64, count: int, cameras: list[Camera]) -> I64:
+    def _choose_rows(self, finer: SplatModel, nodes: I64, count: int, cameras: list[Camera]) -> I64:
+        """Return the ascending rows, int64, of about `count` splats that matter most in views, at least one by node.
+
+        Args:
+            finer: the splats to choose from.
+            nodes: [N], the node of each splat.
+            count: number of splats; more are chosen if nodes would have none.
+            cameras: the views.
+        """
         groups = [
             MeasuredViews.of(finer, part, (0.0, 0.0, 0.0), context=self.context)
             for part in (cameras[::2], cameras[1::2])
@@ -121,14 +134,15 @@ class LevelFitter:
         light = light_of(finer)
         unseen = np.flatnonzero(~total_error(groups).seen)
         unseen = unseen[np.argsort(-light[unseen], kind="stable")]
-        left = np.delete(np.arange(len(finer)), unseen[len(unseen) * count // len(finer) :])
-        groups = [replace(group, pruning_error=group.pruning_error.of_rows(left)) for group in groups]
-        order = PruningOrder(finer.select(left), groups, context=self.context)
-        rows = left[order.kept(count)]
+        remaining = np.delete(np.arange(len(finer)), unseen[len(unseen) * count // len(finer) :])
+        groups = [replace(group, pruning_error=group.pruning_error.of_rows(remaining)) for group in groups]
+        order = PruningOrder(finer.select(remaining), groups, context=self.context)
+        rows = remaining[order.kept(count)]
         by_node = np.lexsort((light, nodes))
         brightest = by_node[np.flatnonzero(np.diff(nodes[by_node], append=-1))]  # the last of each node
         return np.union1d(rows, brightest[~np.isin(nodes[brightest], nodes[rows])])
 
 
-def _between(value: float, bounds: tuple[int, int]) -> int:
+def _clip_rounded(value: float, bounds: tuple[int, int]) -> int:
+    """Clip a number to bounds, and round it."""
     return round(min(max(value, bounds[0]), bounds[1]))

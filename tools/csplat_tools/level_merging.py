@@ -54,21 +54,21 @@ def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, S
     """
     splats = replace(splats, extra={}, means_double=None)
     while len(splats) > count:
-        kept = max(count, math.floor(_KEPT * len(splats)))
-        pairs = _pairs(splats, nodes, len(splats) - kept)
+        kept_count = max(count, math.floor(_KEPT * len(splats)))
+        pairs = _choose_pairs(splats, nodes, len(splats) - kept_count)
         if not len(pairs[0]):
             break
-        splats = _merged(splats, pairs)
-        left = np.ones(len(nodes), bool)
-        left[pairs[1]] = False
-        splats, nodes = splats.select(np.flatnonzero(left)), nodes[left]
+        splats = _merge_pairs(splats, pairs)
+        is_kept = np.ones(len(nodes), bool)
+        is_kept[pairs[1]] = False  # merged into the first splat of the pair
+        splats, nodes = splats.select(np.flatnonzero(is_kept)), nodes[is_kept]
     return nodes, splats
 
 
-def _pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
+def _choose_pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
     """Return the rows of disjoint pairs of neighbours in the same node, the cheapest, at most `most`, [2, M]."""
     edges = _neighbours(splats.means, nodes)
-    cheapest = np.argsort(_costs(splats, edges), kind="stable")
+    cheapest = np.argsort(_merge_costs(splats, edges), kind="stable")
     partners = np.full(len(splats), -1)
     _pair_up(edges, cheapest, most, partners)
     first = np.flatnonzero(partners > np.arange(len(splats)))
@@ -77,7 +77,14 @@ def _pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
 
 @kernel
 def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
-    """Pair the splats of each edge [2, M], in this order, if neither has a partner; stop after `most` pairs."""
+    """Pair the splats of the edges, in the given order, if neither has a partner; stop after `most` pairs.
+
+    Args:
+        edges: [2, M], rows of two splats.
+        order: [M], indices of edges.
+        most: largest number of pairs.
+        partners: [N], the row of each splat's partner, written here; -1 initially, and for splats without a partner.
+    """
     count = 0
     for edge in order:
         if count == most:
@@ -89,7 +96,15 @@ def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
 
 
 def _neighbours(means: F32, nodes: I64) -> I64:
-    """Return the rows of each splat and its nearest neighbours in the same node, in ascending order, [2, M]."""
+    """Return each splat with its up to `_NEIGHBOURS` nearest neighbours in the same node, as edges.
+
+    Args:
+        means: [N, 3].
+        nodes: [N], the node of each splat.
+
+    Returns:
+        [2, M] int64, the rows of both splats, the lower first; each edge once, ascending. M is 0 if each is alone.
+    """
     by_node = np.argsort(nodes, kind="stable")
     edge_keys = [np.zeros(0, np.int64)]
     for rows in np.split(by_node, np.flatnonzero(np.diff(nodes[by_node])) + 1):
@@ -101,27 +116,39 @@ def _neighbours(means: F32, nodes: I64) -> I64:
         near = KDTree(places).query(places, k=count)[1].reshape(len(rows), count)
         starts = np.repeat(rows, count)
         ends = rows[near.reshape(-1)]
+        # One integer for both rows; a splat that is its own neighbour is left out.
         edge_keys.append((np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))[starts != ends])
     keys = np.sort(np.concatenate(edge_keys))
     return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(means)))
 
 
-def _costs(splats: SplatModel, edges: I64) -> F64:
-    """Return the cost of each edge, divided by a power of its energy, [M]."""
+def _merge_costs(splats: SplatModel, edges: I64) -> F64:
+    """Return the cost of merging the splats of each edge, [M]; `edges` are rows, [2, M]."""
     scales = splats.scales.astype(np.float64)
     scales = np.maximum(scales, scales.max(axis=1, keepdims=True) + math.log(_THINNEST))
     covariances = covariance_entries(splats.quats.T, np.exp(2.0 * scales).T)
     colours = np.maximum(SH_C0 * splats.sh0 + 0.5, 0.0)
     amplitudes = splats.opacities[:, None] * np.column_stack([colours, np.ones(len(splats))])
     light = light_of(splats)
-    blocks = (edges[:, at : at + _BLOCK] for at in range(0, edges.shape[1], _BLOCK))
+    blocks = (edges[:, start : start + _BLOCK] for start in range(0, edges.shape[1], _BLOCK))
     return np.concatenate(
         [np.zeros(0), *(_block_costs(splats.means, covariances, amplitudes, light, block) for block in blocks)]
     )
 
 
 def _block_costs(means: F32, covariances: F64, amplitudes: F64, light: F64, edges: I64) -> F64:
-    """Return the cost of each edge, [M]; amplitudes are red, green, blue and alpha of each splat, [N, 4]."""
+    """Return the cost of merging the splats of each edge: what images along the three axes change, squared.
+
+    Args:
+        means: [N, 3].
+        covariances: [6, N], entries in the order of `_AXES`.
+        amplitudes: [N, 4], red, green, blue and alpha of each splat.
+        light: [N], the weight of each splat in a merged splat.
+        edges: [2, M], rows of two splats.
+
+    Returns:
+        [M], the squared error, up to a factor, divided by a power of the energy of both splats.
+    """
     i, j = edges
     a, b = amplitudes[i], amplitudes[j]
     aa, bb, ab = (np.einsum("nc,nc->n", left, right) for left, right in ((a, a), (b, b), (a, b)))
@@ -166,24 +193,31 @@ def _overlap(first: tuple[F64, ...], second: tuple[F64, ...], x: F64, y: F64) ->
 
 
 def _determinant(entries: tuple[F64, ...]) -> F64:
+    """Return the determinants of covariances in a plane, above 0, from their entries xx, xy, yy, [n] each."""
     product = entries[0] * entries[2]
     return np.maximum(product - entries[1] * entries[1], _SINGULAR * product) + _TINY
 
 
-def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
-    """Return all splats, with the first splat of each pair, [2, P], replaced by the merged splat."""
+def _merge_pairs(splats: SplatModel, pairs: I64) -> SplatModel:
+    """Return all splats, with the first splat of each pair replaced by the merged splat, and the second unchanged.
+
+    Args:
+        splats: [N] splats, which are not changed.
+        pairs: [2, P], rows of two splats; no splat is in two pairs.
+    """
     two = [splats.select(rows) for rows in pairs]
     light = [light_of(part) for part in two]
     share = light[0] / (light[0] + light[1])
 
     def averaged(first: NDArray[np.floating], second: NDArray[np.floating]) -> F64:
+        """Return the averages of [P, ...] values, weighted by light."""
         weights = share.reshape(-1, *[1] * (first.ndim - 1))
         return np.asarray(weights * first + (1.0 - weights) * second)
 
     offsets = (two[1].means.astype(np.float64) - two[0].means).T
-    inside = [covariance_entries(part.quats.T, np.exp(2.0 * part.scales.astype(np.float64)).T) for part in two]
-    apart = np.stack([offsets[i] * offsets[j] for i, j in _AXES]) * (share * (1.0 - share))
-    covariances = averaged(inside[0].T, inside[1].T).T + apart
+    own_covariances = [covariance_entries(part.quats.T, np.exp(2.0 * part.scales.astype(np.float64)).T) for part in two]
+    between = np.stack([offsets[i] * offsets[j] for i, j in _AXES]) * (share * (1.0 - share))  # covariance of centres
+    covariances = averaged(own_covariances[0].T, own_covariances[1].T).T + between
     trace = np.maximum(covariances[:3].sum(axis=0), _TINY)
     quats, scales = mean_axes(covariances / trace)
     scales = (scales + 0.5 * np.log(trace)[:, None]).astype(np.float32)

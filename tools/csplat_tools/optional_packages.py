@@ -118,6 +118,7 @@ def require_data_sets() -> None:
 
 
 def _warm_up_adam() -> None:
+    """Compile the kernels of a training step, by a step of few values."""
     import numpy as np
 
     from csplat_trainer.parameters import Parameters, adam_step
@@ -127,27 +128,35 @@ def _warm_up_adam() -> None:
 
 
 def _need(module: str, package: str | None = None, *, extra: str = "render") -> None:
+    """Import a module of an optional package.
+
+    Raises:
+        InputError: it is not installed; the message names the package and the extra that has it.
+    """
     try:
         import_module(module)
     except ModuleNotFoundError as error:
         raise missing_package(error, package, extra=extra) from None
 
 
+_STDERR = 2  # file descriptor of standard error
+
+
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Discard what this process and its children write to standard error."""
+    """Discard what this process and its children write to standard error, until the context ends; it may be closed."""
     try:
-        kept = os.dup(2)
+        original = os.dup(_STDERR)
     except OSError:  # it is closed
         yield
         return
     try:
         with open(os.devnull, "wb") as null:  # noqa: PTH123  # no path of ours
-            os.dup2(null.fileno(), 2)
+            os.dup2(null.fileno(), _STDERR)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(original, _STDERR)
+        os.close(original)
 
 
 def _limit_spinning() -> None:

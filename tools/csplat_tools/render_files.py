@@ -186,10 +186,15 @@ def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
         OSError: the file cannot be written.
     """
     kind = FILM_ENDINGS[Path(path).suffix.lower()]
-    write_bytes(path, _mp4(frames, fps) if kind == _MP4 else _animation(kind, frames, fps))
+    write_bytes(path, _encode_mp4(frames, fps) if kind == _MP4 else _encode_animation(kind, frames, fps))
 
 
-def _animation(kind: str, frames: Sequence[U8], fps: float) -> bytes:
+def _encode_animation(kind: str, frames: Sequence[U8], fps: float) -> bytes:
+    """Encode frames as an animation that repeats for ever, or a single frame as an image; `kind` is pillow's name.
+
+    Raises:
+        InputError: pillow is not installed, or was built without this format.
+    """
     require_images()
     from PIL import Image
 
@@ -207,7 +212,12 @@ def _animation(kind: str, frames: Sequence[U8], fps: float) -> bytes:
     return buffer.getvalue()
 
 
-def _mp4(frames: Sequence[U8], fps: float) -> bytes:
+def _encode_mp4(frames: Sequence[U8], fps: float) -> bytes:
+    """Encode frames, [H, W, 3] uint8, as H.264 in MP4; odd sides lose a row or column.
+
+    Raises:
+        InputError: PyAV is not installed, or was built without H.264.
+    """
     require_film()
     import av
 

@@ -73,10 +73,15 @@ def load_scene(
     return scene.loaded()
 
 
-def _check_fits(wanted: int) -> None:
-    free = available_memory_bytes()
-    if wanted > free:
-        raise LimitError("memory for all splats at once", wanted, free)
+def _check_fits(wanted_bytes: int) -> None:
+    """Check that this number of bytes is available in memory.
+
+    Raises:
+        LimitError: it is not.
+    """
+    free_bytes = available_memory_bytes()
+    if wanted_bytes > free_bytes:
+        raise LimitError("memory for all splats at once", wanted_bytes, free_bytes)
 
 
 def splats_to_frame(path: str, model: SplatModel) -> SplatModel:
@@ -176,7 +181,7 @@ def open_scenes(scenes: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT)
         has_large = context.memory is not None or any(size_on_disk(path) > _SMALL for path in local.values())
         if len(local) == len(scenes) and has_large:
             with ExitStack() as opening:
-                opened = [_opened(opening, scenes[place], path) for place, path in local.items()]
+                opened = [_open_on_stack(opening, scenes[place], path) for place, path in local.items()]
                 if _together_bytes(opened) > context.memory_limit:
                     stack.push(opening.pop_all())
                     yield opened
@@ -191,11 +196,13 @@ def open_scenes(scenes: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT)
         yield loaded
 
 
-def _opened(stack: ExitStack, source: object, path: Path) -> Scene:
+def _open_on_stack(stack: ExitStack, source: object, path: Path) -> Scene:
+    """Open a scene until the stack ends; errors of opening and, but for .csplat files, of reading name the source."""
     with naming(source):
         scene = stack.enter_context(csplat.open(path))
 
     def reader() -> Iterator[SplatModel]:
+        """Yield the scene's blocks; errors name the source."""
         with naming(source):
             yield from scene.blocks()
 

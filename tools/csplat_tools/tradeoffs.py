@@ -91,12 +91,17 @@ def parse_grid(text: str = ",".join(GROUPS), preset: PresetName = "balanced") ->
         if group not in GROUPS:
             raise InputError(f"{group!r} is not a group of settings, expected some of {', '.join(GROUPS)}")
         for value in (values or GROUPS[group]).split(":"):
-            setting = _setting(group, value.strip(), EncodeOptions(preset=preset))
+            setting = _parse_setting(group, value.strip(), EncodeOptions(preset=preset))
             settings.setdefault(setting.name, setting)
     return list(settings.values())
 
 
-def _setting(group: str, value: str, options: EncodeOptions) -> GridSetting:
+def _parse_setting(group: str, value: str, options: EncodeOptions) -> GridSetting:
+    """Return the setting of a value in a group; `targets` takes a PSNR in dB, or a size with a unit such as `1MB`.
+
+    Raises:
+        InputError: the value is invalid for the group.
+    """
     if group == "presets":
         options = replace(options, preset=cast(PresetName, value))  # the options refuse other values
         return GridSetting(group, value, options, None, ("--preset", value))
@@ -238,13 +243,14 @@ def tradeoff(
     around = views or find_view_set(source.model(), seed=context.seed)
 
     def measure(setting: GridSetting) -> TradeoffRow:
+        """Encode the scene with a setting, decode the file, and score it."""
         start = time.perf_counter()
         used = around if setting.target else None
         made = encode_with_report(source.model(), setting.options, target=setting.target, views=used, context=context)
         encode_seconds = time.perf_counter() - start
-        decoded, decode_seconds = _decode(made.data, context)
+        decoded, decode_seconds = _time_decoding(made.data, context)
         compared = compare(source, decoded, views=around, source_index=made.source_index, context=context)
-        words = (path, _output(path, setting), *setting.words, *(view_words if setting.target else ()))
+        words = (path, _suggested_name(path, setting), *setting.words, *(view_words if setting.target else ()))
         return TradeoffRow(
             setting, shlex.join(("csplat", "encode", *words)), len(made.data), source.size_bytes / len(made.data),
             len(decoded), compared.quality.psnr, compared.quality.ssim, compared.image_scores, encode_seconds,
@@ -289,17 +295,20 @@ def measure_grid(
     return sorted(rows, key=lambda row: row.size_bytes), failures
 
 
-def _decode(data: bytes, context: Context) -> tuple[SplatModel, float]:
-    """Return the decoded splats, and the median of the times in seconds."""
-    models, seconds = list[SplatModel](), list[float]()
+def _time_decoding(data: bytes, context: Context) -> tuple[SplatModel, float]:
+    """Return the decoded splats, and the median of the times of `_DECODE_RUNS` runs in seconds."""
+    seconds = list[float]()
+    model: SplatModel | None = None
     for _ in range(_DECODE_RUNS):
         start = time.perf_counter()
-        models[:] = [decode(data, context=context)]
+        model = decode(data, context=context)
         seconds.append(time.perf_counter() - start)
-    return models[0], statistics.median(seconds)
+    assert model is not None  # there is at least one run
+    return model, statistics.median(seconds)
 
 
-def _output(path: str, setting: GridSetting) -> str:
+def _suggested_name(path: str, setting: GridSetting) -> str:
+    """Return the name of the file that the command of a setting writes, by the source's name and the setting."""
     stem = "scene" if path == STANDARD_STREAM else PurePath(path).stem
     return f"{stem}-{setting.group}-{setting.value}.csplat"
 
@@ -337,6 +346,7 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
 
 
 def _summary(tradeoff: Tradeoff) -> str:
+    """Return a line on the source: name, splats, size, views, and its PSNR against images if there are any."""
     source, views = tradeoff.source, tradeoff.views
     text = (
         f"{source.name}: {len(source.model()):,} splats, SH degree {source.model().sh_degree},"
@@ -393,6 +403,7 @@ def make_tradeoff_page(tradeoff: Tradeoff) -> str:
 
 
 _SECONDS = "encode_seconds"  # the attribute with a logarithmic axis
+_MARK_RADIUS = 4.0  # half the side of the square that a mark takes, pixels
 _SIZE = (7.0, 4.4)  # width and height of a plot, inches
 _STYLES = {  # markers, in colours that colour-blind readers can tell apart, on white and on black
     "presets": ("s", "#d55e00"),
@@ -409,13 +420,22 @@ _PLACES = tuple(
 
 
 def _plot(tradeoff: Tradeoff, key: str, label: str, level: float | None = None) -> str:
-    """Draw an attribute of the rows against their size, and a dotted line at the source's level, if given."""
+    """Return a plot of an attribute of the rows by their size, as SVG.
+
+    Args:
+        tradeoff: the rows; the last has the largest file, which determines the unit of sizes.
+        key: name of the attribute. `psnr` has a dashed line through the best files, `_SECONDS` a logarithmic axis.
+        label: label of the axis.
+        level: level of the source, for a dotted line; `None`: no line.
+    """
     unit, divisor = ("MB", 1e6) if tradeoff.rows[-1].size_bytes >= 1e6 else ("kB", 1e3)
 
     def marks(rows: Sequence[TradeoffRow]) -> list[tuple[float, float]]:
+        """Return the size, in the plot's unit, and the attribute of each row."""
         return [(row.size_bytes / divisor, getattr(row, key)) for row in rows]
 
     def draw(figure: Figure) -> None:
+        """Draw the marks of each group, lines, legend and labels."""
         axes = figure.add_subplot()
         axes.set(xlabel=f"size, {unit}", ylabel=label, xscale="log", yscale="log" if key == _SECONDS else "linear")
         axes.margins(0.1)
@@ -437,7 +457,7 @@ def _plot(tradeoff: Tradeoff, key: str, label: str, level: float | None = None) 
 
 
 def _use_plain_ticks(axis: Any) -> None:
-    """Write plain numbers on a logarithmic axis."""
+    """Write plain numbers on a logarithmic axis; leave a linear axis as it is."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     if axis.get_scale() == "log":
@@ -447,10 +467,19 @@ def _use_plain_ticks(axis: Any) -> None:
 
 
 def _label_marks(axes: Axes, marks: Sequence[tuple[float, float]], texts: Sequence[str]) -> None:
-    """Write a label next to each mark, where it covers neither marks nor other labels if there is such a place."""
+    """Write a label next to each mark, at the first of `_PLACES` where it covers neither marks nor other labels.
+
+    If there is no such place, it is written at the last. The limits of the axes must be final.
+
+    Args:
+        axes: the axes.
+        marks: coordinates of the marks, in the units of the data.
+        texts: the label of each mark.
+    """
     from matplotlib.transforms import Bbox
 
-    taken = [Bbox([at - 4.0, at + 4.0]) for at in axes.transData.transform(marks)]
+    centres = axes.transData.transform(marks)
+    taken = [Bbox([centre - _MARK_RADIUS, centre + _MARK_RADIUS]) for centre in centres]
     for mark, text in zip(marks, texts, strict=True):
         label = axes.annotate(text, mark, (0.0, 0.0), textcoords="offset points", fontsize="small")
         label.set_in_layout(False)

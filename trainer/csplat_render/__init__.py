@@ -122,12 +122,16 @@ def render(
 
 
 def _find_device(backend: Backend) -> Device | None:
-    """Return the GPU of a backend; `None` for the CPU."""
+    """Return the GPU of a backend; `None` for the CPU, after a warning if `auto` finds no GPU.
+
+    Raises:
+        InputError: there is no such backend; or no GPU, and the backend requires one.
+    """
     if backend == "cpu":
         return None
     from csplat_render.gpu.device import find_device
 
     device, reason = find_device(backend)
     if reason:
-        warnings.warn(f"{reason}: rendering on the CPU", stacklevel=3)
+        warnings.warn(f"{reason}: rendering on the CPU", stacklevel=3)  # of the caller of `render`
     return device

@@ -82,7 +82,10 @@ def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, 
 
 @device_function
 def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
-    """Return the columns and rows of the tiles of a box; and True if it is too small for `_row_span` to pay off."""
+    """Return first column, end of columns, first row and end of rows of the tiles of box j; and True if it is small.
+
+    In small boxes, and in a single row or column of tiles, `_row_span` does not pay off. `box` is [V, 4], pixels.
+    """
     first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
     top, bottom = box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1
     width, height = last - first, bottom - top
@@ -92,6 +95,9 @@ def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
 @device_function
 def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
     """Return the range of tiles in a row of tiles that the ellipse of a splat touches (see "Extent" in `projection`).
+
+    The range is within the box's columns, `first` to `last`; it is all of them if the ellipse overflows, and empty if
+    the ellipse lies to the right of them.
 
     Within the row's heights, the right end of the chord is farthest at the height of the ellipse's rightmost point,
     clamped to the row, and the left end at the height of its leftmost point.

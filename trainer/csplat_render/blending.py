@@ -194,13 +194,13 @@ def gather_batch(
         rows[k - begin, 0] = max(box[i, 2] - Y0, low) if seen else 0
         rows[k - begin, 1] = min(box[i, 3] - Y0, high) if seen else 0
         c0, cx, cy, cxx, cxy, cyy = c0 * _LOG2E, cx * _LOG2E, cy * _LOG2E, cxx * _LOG2E, cxy * _LOG2E, cyy * _LOG2E
-        one = batch[k - begin]
+        splat = batch[k - begin]
         for y in range(len(ys)):
-            one[ROW0 + y] = c0 + ys[y] * (cy + ys[y] * cyy)
-            one[ROW1 + y] = cx + ys[y] * cxy
-        one[TAIL] = cxx
+            splat[ROW0 + y] = c0 + ys[y] * (cy + ys[y] * cyy)
+            splat[ROW1 + y] = cx + ys[y] * cxy
+        splat[TAIL] = cxx
         for n in range(5):
-            one[TAIL + 1 + n] = shape[i, 5 + n]
+            splat[TAIL + 1 + n] = shape[i, 5 + n]
 
 
 @device_function
@@ -217,13 +217,13 @@ def narrow_rows(count: int, batch: Any, rows: Any) -> None:
     """
     edge = np.float32(HALF_TILE - 0.5)
     for j in range(count):
-        one = batch[j]
-        a, least = one[TAIL], one[TAIL + 5]
+        splat = batch[j]
+        a, least = splat[TAIL], splat[TAIL + 5]
         middle = np.float32(-0.5) / a
         first, end = np.int32(TILE), np.int32(0)
         for y in range(TILE):
-            at = min(max(one[ROW1 + y] * middle, -edge), edge)
-            peak = (a * at + one[ROW1 + y]) * at + one[ROW0 + y]
+            x = min(max(splat[ROW1 + y] * middle, -edge), edge)
+            peak = (a * x + splat[ROW1 + y]) * x + splat[ROW0 + y]
             faint = peak < least  # False for NaN, the peak of an infinitely long splat
             first = min(first, np.int32(TILE) if faint else np.int32(y))
             end = max(end, np.int32(0) if faint else np.int32(y + 1))
@@ -268,7 +268,10 @@ def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[A
 
 
 def _make_blend(counted: bool) -> ParallelKernel[...]:
-    """Make `blend`; if `counted`, a variant that stores the position of each pixel's last splat instead of depth."""
+    """Return the kernel `blend`, or if `counted`, `blend_counted`, which stores each pixel's last splat, not depth.
+
+    `counted` is a constant of the compiled kernel, so neither variant tests it.
+    """
 
     @parallel_kernel(relaxed=True)
     def blend(
@@ -315,7 +318,7 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
                 planes[y, 5 * TILE + x] = ys[x]
         batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
         alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
-        zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+        zero, one = alpha_min - alpha_min, alpha_min / alpha_min  # in the dtype of the pixels
         nothing = -one if counted else zero
         for tile in range(lane, len(used), lanes):
             X0, Y0, columns, on_render = tile_extent(tile, tiles_x, width, height)
@@ -358,11 +361,11 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
                 store_state(state, X0, Y0, columns, on_render, planes)
             for y in range(on_render):
                 for x in range(columns):
-                    left = abs(planes[y, x])
-                    rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + left * background[0]
-                    rgb[Y0 + y, X0 + x, 1] = planes[y, 2 * TILE + x] + left * background[1]
-                    rgb[Y0 + y, X0 + x, 2] = planes[y, 3 * TILE + x] + left * background[2]
-                    transmittance[Y0 + y, X0 + x] = left
+                    remaining = abs(planes[y, x])  # negative for finished pixels
+                    rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + remaining * background[0]
+                    rgb[Y0 + y, X0 + x, 1] = planes[y, 2 * TILE + x] + remaining * background[1]
+                    rgb[Y0 + y, X0 + x, 2] = planes[y, 3 * TILE + x] + remaining * background[2]
+                    transmittance[Y0 + y, X0 + x] = remaining
                     fifth[Y0 + y, X0 + x] = planes[y, 4 * TILE + x]
 
     return blend

@@ -133,7 +133,7 @@ def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
 
 
 def _checked_size(name: str, value: Any) -> int:
-    """Return a number of pixels; raise an `InputError` unless it is whole, and 1 to `MAX_IMAGE_SIZE`."""
+    """Return a number of pixels as an int; raise an `InputError` unless it is whole, and 1 to `MAX_IMAGE_SIZE`."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"the camera's {name} is {value!r}, expected a number of pixels")
     if not (math.isfinite(value) and value == int(value) and 1 <= value <= MAX_IMAGE_SIZE):
@@ -142,7 +142,7 @@ def _checked_size(name: str, value: Any) -> int:
 
 
 def _checked_near(value: Any) -> float:
-    """Return the distance of the near plane; raise an `InputError` unless it is finite and above 0."""
+    """Return the distance of the near plane, scene units; raise an `InputError` unless it is finite and above 0."""
     try:
         near = float(value)
     except (TypeError, ValueError):
@@ -161,7 +161,7 @@ def _check_intrinsics(K: F64) -> None:
 
 
 def _check_pose(viewmat: F64) -> None:
-    """Raise an `InputError` unless a viewmat, [4, 4], is a rotation and a translation."""
+    """Raise an `InputError` unless a viewmat, [4, 4], is a rotation (to `_ROTATION_TOLERANCE`) and a translation."""
     R = viewmat[:3, :3]
     check_last_row(viewmat, "the camera's viewmat")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -176,6 +176,9 @@ _OUTLIER_DISTANCE = 20.0  # minimum distance of an outlier from the middle, in m
 _OUTLIER_GAP = 4.0  # minimum distance of an outlier, in largest distances of the other cameras
 _CONVERGENT = 0.7  # minimum `convergence` of cameras that look at one subject
 _MOST_OUTLIERS = 1.0 / 3.0  # maximum fraction of outliers
+_OTHERS_MIN = 3  # minimum number of cameras that are not outliers
+_TOWARDS_MEAN = 1e-6  # weight of the distance from the mean position, next to that from a line of sight
+_SMALLEST_UNIT = 1e-300  # scene units; avoids a division by 0 if all cameras are in one place
 
 
 def central_camera(cameras: Sequence[Camera]) -> Camera:
@@ -190,9 +193,10 @@ def central_camera(cameras: Sequence[Camera]) -> Camera:
     cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
     places = np.stack([camera.position for camera in cameras])
     ahead = np.stack([camera.viewmat[2, :3] for camera in cameras])
-    away = np.sqrt(np.sum((places - places.mean(axis=0)) ** 2, axis=1))
-    turned = np.sqrt(np.sum((ahead - ahead.mean(axis=0)) ** 2, axis=1))
-    return cameras[int(np.argmin(away / max(float(away.mean()), 1e-300) + turned))]
+    distances = np.sqrt(np.sum((places - places.mean(axis=0)) ** 2, axis=1))
+    deviations = np.sqrt(np.sum((ahead - ahead.mean(axis=0)) ** 2, axis=1))
+    unit = max(float(distances.mean()), _SMALLEST_UNIT)
+    return cameras[int(np.argmin(distances / unit + deviations))]
 
 
 def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> Mask:
@@ -215,7 +219,9 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
     order = np.argsort(distances, kind="stable")
     away = distances[order]
     for first in range(math.ceil((1.0 - _MOST_OUTLIERS) * len(away)), len(away)):
-        if first < 3 or not away[first] > max(_OUTLIER_DISTANCE * away[len(away) // 2], _OUTLIER_GAP * away[first - 1]):
+        if first < _OTHERS_MIN or not away[first] > max(
+            _OUTLIER_DISTANCE * away[len(away) // 2], _OUTLIER_GAP * away[first - 1]
+        ):
             continue
         others = order[:first]
         if points is not None and len(points):
@@ -256,11 +262,11 @@ def nearest_point(positions: F64, axes: F64) -> F64:
     Returns:
         [3]. A small additional term favours points near the mean position, which matters for parallel lines.
     """
-    weight = 1e-6 * len(positions)
+    weight = _TOWARDS_MEAN * len(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    left = across.sum(axis=0) + weight * np.eye(3)
-    right = np.einsum("nij,nj->i", across, positions) + weight * positions.mean(axis=0)
-    return np.asarray(np.linalg.solve(left, right), np.float64)
+    matrix = across.sum(axis=0) + weight * np.eye(3)
+    vector = np.einsum("nij,nj->i", across, positions) + weight * positions.mean(axis=0)
+    return np.asarray(np.linalg.solve(matrix, vector), np.float64)
 
 
 def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
@@ -373,7 +379,10 @@ def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
 
 
 def _cross(a: F64, b: F64) -> F64:
-    """Return `np.cross` of two vectors [3], bit for bit. Its overhead would matter for hundreds of cameras."""
+    """Return the vector product [3] of two vectors [3].
+
+    It equals `np.cross` bit for bit, whose overhead would matter for hundreds of cameras.
+    """
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

@@ -34,7 +34,7 @@ _MAX_FOCAL_RATIO = 3.0  # between the horizontal and vertical focal length
 _OFF_CENTRE = 10.0  # maximum distance of the principal point from 0, relative to the image's side
 _SWAPPED = 0.02  # tolerance for a principal point that fits the swapped image size, relative to half a side
 _NERFSTUDIO_NEAR = 0.01  # near plane of nerfstudio's renderer, scene units
-_SCALE_TOLERANCE = 1e-3
+_SCALE_TOLERANCE = 1e-3  # relative difference of the axes' lengths; also of a scale from 1 that is reported
 _ANGLE_TOLERANCE = 0.01  # relative difference between a focal length and an angle of view; files have few digits
 #: Files with poses that are not read: fields of the document, or of each entry of a list; and what to use instead.
 _UNREAD = (
@@ -64,7 +64,7 @@ _UNREAD = (
     ),
 )
 _COLMAP = {"cameras.bin", "images.bin", "cameras.txt", "images.txt"}
-_LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
+_LISTED_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -93,7 +93,7 @@ def load_cameras(
     entries = read_json(path)
     cameras = parse_foreign_cameras(entries, str(path), report)
     if cameras is None:
-        cameras = _own_cameras(entries, path)
+        cameras = _parse_own_cameras(entries, path)
     for number, camera in enumerate(cameras):
         K = camera.K
         focals, middle = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
@@ -140,12 +140,17 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
                 " path in its viewer, with a duration above 0, and export it again"
             )
         cameras = _parse_each(
-            document["camera_path"], where, "camera_path", lambda e, at: _parse_nerfstudio(document, e, at)
+            document["camera_path"],
+            where,
+            "camera_path",
+            lambda entry, place: _parse_nerfstudio(document, entry, place),
         )
         report.append(f"{where} is a camera path of nerfstudio: {counted(len(cameras), 'camera')}")
         return cameras
     if isinstance(document.get("frames"), list):
-        cameras = _parse_each(document["frames"], where, "frame", lambda e, at: _parse_frame(document, e, at))
+        cameras = _parse_each(
+            document["frames"], where, "frame", lambda frame, place: _parse_frame(document, frame, place)
+        )
         report.append(f"{where} is a transforms.json: {counted(len(cameras), 'camera')}")
         report += describe_scales([frame["transform_matrix"] for frame in document["frames"]], where)
         if any(values.get(key) for key in _DISTORTION for values in (document, *document["frames"])):
@@ -159,8 +164,8 @@ def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[
     own = {**frame, **_intrinsics_of_matrix(frame)}
     values = {**document, **own}
     listed = values.get("distortion_params")  # nerfstudio
-    if isinstance(listed, list) and len(listed) == len(_LISTED):
-        values |= dict(zip(_LISTED, listed, strict=True))
+    if isinstance(listed, list) and len(listed) == len(_LISTED_DISTORTION):
+        values |= dict(zip(_LISTED_DISTORTION, listed, strict=True))
     for axis in "xy":
         if f"fl_{axis}" in own and f"camera_angle_{axis}" not in own:
             values.pop(f"camera_angle_{axis}", None)
@@ -257,8 +262,8 @@ def focal_lengths(
     Raises:
         InputError: no value is specified, a value is out of range, or two values contradict each other.
     """
-    fx = _focal(values, "x", width, where, fisheye=fisheye)
-    fy = _focal(values, "y", height, where, fisheye=fisheye)
+    fx = _focal_along(values, "x", width, where, fisheye=fisheye)
+    fy = _focal_along(values, "y", height, where, fisheye=fisheye)
     if fx is None and fy is None:
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     fx, fy = fx or fy, fy or fx  # square pixels unless both are specified
@@ -318,12 +323,20 @@ def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
     return [f"{where}: {counted(len(scaled), 'pose')} scaled (the first by {scaled[0]:g}): removed, positions stay"]
 
 
-def _own_cameras(entries: object, path: Path) -> list[Camera]:
-    """Read a list of cameras in csplat's own form; raise an `InputError` that names other contents of the file."""
+def _parse_own_cameras(entries: object, path: Path) -> list[Camera]:
+    """Parse a list of cameras in csplat's own form.
+
+    Args:
+        entries: contents of a JSON file.
+        path: the file, for messages.
+
+    Raises:
+        InputError: a camera is invalid, or there are none; the message names the contents of known other files.
+    """
     first = entries[0] if isinstance(entries, list) and entries else entries
-    unread = [text for fields, text in _UNREAD if isinstance(first, Mapping) and fields <= first.keys()]
-    if unread:
-        raise InputError(f"{path} {unread[0]}")
+    hints = [hint for fields, hint in _UNREAD if isinstance(first, Mapping) and fields <= first.keys()]
+    if hints:
+        raise InputError(f"{path} {hints[0]}")
     if not isinstance(entries, list) or not entries:
         raise InputError(
             f"{path} is not a camera file, expected a list of {{K, viewmat, W, H}}, cameras.json of INRIA, a camera "
@@ -339,22 +352,32 @@ def _own_cameras(entries: object, path: Path) -> list[Camera]:
 
 
 def _parse_each(
-    entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]
+    entries: list[Any], where: str, kind: str, parse: Callable[[Mapping[str, Any], str], Camera]
 ) -> list[Camera]:
-    """Parse the entries of a list; error messages contain the file and the entry."""
+    """Parse the entries of a list.
+
+    Args:
+        entries: the list.
+        where: the file, for messages.
+        kind: a word for an entry, for messages.
+        parse: returns the camera of an entry; its second argument is the file and the entry, for messages.
+
+    Raises:
+        InputError: the list is empty, or an entry is not an object or invalid.
+    """
     if not entries:
         raise InputError(f"{where} lists no cameras")
     cameras = []
     for index, entry in enumerate(entries):
-        at = f"{where}, {kind} {index}"
+        place = f"{where}, {kind} {index}"
         if not isinstance(entry, Mapping):
-            raise InputError(f"{at} is {type(entry).__name__}, expected an object")
-        cameras.append(read(entry, at))
+            raise InputError(f"{place} is {type(entry).__name__}, expected an object")
+        cameras.append(parse(entry, place))
     return cameras
 
 
 def _make_camera(
-    at: str,
+    where: str,
     focals: tuple[float, float],
     middle: tuple[float, float],
     viewmat: F64,
@@ -362,75 +385,105 @@ def _make_camera(
     near: float,
     image: Any,
 ) -> Camera:
-    """Build a camera; error messages begin with `at`.
+    """Build a camera; error messages begin with `where`.
 
     Args:
-        at: file and entry.
+        where: file and entry.
         focals, middle: fx, fy and cx, cy, pixels.
         viewmat: [4, 4].
         size: width and height, pixels.
         near: near plane, scene units.
         image: name of the image, or `None`.
+
+    Raises:
+        InputError: the size, the intrinsics, the pose or the near plane is invalid.
     """
     (fx, fy), (cx, cy), (width, height) = focals, middle, size
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     try:
         return Camera.from_json({"K": K, "viewmat": viewmat, "W": width, "H": height, "near": near, "image": image})
     except InputError as error:
-        raise InputError(f"{at}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
 
 
-def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
-    """Read an entry of cameras.json; the principal point is the middle of the image."""
-    width, height = finite_number(entry, "width", at), finite_number(entry, "height", at)
-    focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
+def _parse_inria(entry: Mapping[str, Any], where: str) -> Camera:
+    """Parse an entry of cameras.json; the principal point is the middle of the image.
+
+    Raises:
+        InputError: a value is missing, not a number or of another shape, or the rotation is invalid.
+    """
+    width, height = finite_number(entry, "width", where), finite_number(entry, "height", where)
+    focals = finite_number(entry, "fx", where), finite_number(entry, "fy", where)
     try:
         rotation, position = (np.array(entry.get(key), np.float64) for key in ("rotation", "position"))
     except (TypeError, ValueError, OverflowError):
         rotation = position = np.zeros(0)
     if rotation.shape != (3, 3) or position.shape != (3,):
-        raise InputError(f"{at}: rotation or position has another shape, expected [3, 3] and [3]")
+        raise InputError(f"{where}: rotation or position has another shape, expected [3, 3] and [3]")
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ position
     middle = width / 2.0, height / 2.0
-    return _make_camera(at, focals, middle, viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name"))
+    return _make_camera(where, focals, middle, viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name"))
 
 
-def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
-    """Read an entry of a camera path, whose size and type are in the document; `fov` is vertical, degrees."""
+def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], where: str) -> Camera:
+    """Parse an entry of a camera path, whose image size and camera type are in the document.
+
+    `fov` is vertical, in degrees; the principal point is the middle of the image.
+
+    Raises:
+        InputError: the camera is not a perspective, or a value is missing or out of range.
+    """
     kind = str(document.get("camera_type") or "perspective")
     if kind.lower() != "perspective":
-        raise InputError(f"{at}: camera_type is {kind}, expected perspective")
-    width, height = finite_number(document, "render_width", at), finite_number(document, "render_height", at)
-    angle = finite_number(entry, "fov", at)
+        raise InputError(f"{where}: camera_type is {kind}, expected perspective")
+    width, height = finite_number(document, "render_width", where), finite_number(document, "render_height", where)
+    angle = finite_number(entry, "fov", where)
     if not 0.0 < angle < 180.0:
-        raise InputError(f"{at}: fov is {angle:g}, expected degrees above 0 and below 180")
+        raise InputError(f"{where}: fov is {angle:g}, expected degrees above 0 and below 180")
     matrix = entry.get("camera_to_world")
     if isinstance(matrix, list) and len(matrix) == 16:
         matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
-    viewmat = viewmat_of_opengl(matrix, "camera_to_world", at)
+    viewmat = viewmat_of_opengl(matrix, "camera_to_world", where)
     focal, middle = 0.5 * height / math.tan(math.radians(angle) / 2.0), (width / 2.0, height / 2.0)
-    return _make_camera(at, (focal, focal), middle, viewmat, (width, height), _NERFSTUDIO_NEAR, None)
+    return _make_camera(where, (focal, focal), middle, viewmat, (width, height), _NERFSTUDIO_NEAR, None)
 
 
-def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
-    """Read a frame of transforms.json; what it lacks is in the document."""
+def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Camera:
+    """Parse a frame of transforms.json; the document has the values that the frame lacks. Distortion is ignored.
+
+    Raises:
+        InputError: the camera is not a perspective, or a value is missing, out of range or contradicts another.
+    """
     values = frame_values(document, frame)
     if values.get("w") is None or values.get("h") is None:
-        raise InputError(f"{at}: w and h are missing, expected the size of the images (--data reads it from them)")
-    width, height = finite_number(values, "w", at), finite_number(values, "h", at)
+        raise InputError(f"{where}: w and h are missing, expected the size of the images (--data reads it from them)")
+    width, height = finite_number(values, "w", where), finite_number(values, "h", where)
     model = str(values.get("camera_model") or "").upper()
     if values.get("is_fisheye") or model not in PERSPECTIVES:
-        raise InputError(f"{at}: camera_model is {model or 'a fisheye'}, expected one of {', '.join(PERSPECTIVES[1:])}")
-    fx, fy = focal_lengths(values, width, height, at)
-    cx, cy = finite_number(values, "cx", at, width / 2.0), finite_number(values, "cy", at, height / 2.0)
-    viewmat = viewmat_of_opengl(values.get("transform_matrix"), "transform_matrix", at)
-    return _make_camera(at, (fx, fy), (cx, cy), viewmat, (width, height), _NERFSTUDIO_NEAR, values.get("file_path"))
+        raise InputError(
+            f"{where}: camera_model is {model or 'a fisheye'}, expected one of {', '.join(PERSPECTIVES[1:])}"
+        )
+    fx, fy = focal_lengths(values, width, height, where)
+    cx, cy = finite_number(values, "cx", where, width / 2.0), finite_number(values, "cy", where, height / 2.0)
+    viewmat = viewmat_of_opengl(values.get("transform_matrix"), "transform_matrix", where)
+    return _make_camera(where, (fx, fy), (cx, cy), viewmat, (width, height), _NERFSTUDIO_NEAR, values.get("file_path"))
 
 
-def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:
-    """Return the focal length along an axis, from pixels or an angle of view; `None` if neither is specified."""
+def _focal_along(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:
+    """Return the focal length along an axis, pixels, from `fl_*` or `camera_angle_*`; `None` if neither is specified.
+
+    Args:
+        values: values of a frame.
+        axis: "x" or "y".
+        size: width or height of the images, pixels.
+        where: file and place, for messages.
+        fisheye: do not compare the two if both are specified.
+
+    Raises:
+        InputError: a value is out of range, or the two contradict each other.
+    """
     length, angle = values.get(f"fl_{axis}"), values.get(f"camera_angle_{axis}")
     by_angle = None
     if angle is not None and not (fisheye and length is not None):

@@ -43,11 +43,14 @@ _GOOD = 0.85  # detail from which a view is worth showing, as a fraction of the 
 _ARC_MIN = 10.0  # degrees in each direction
 
 _SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees in each direction from a known view; the widest is tried first
+_SWING_CHECKS = 8  # number of views per swing whose detail is checked; the last repeats the first
 _FLATTENED = 0.3  # ratio of the vertical to the horizontal swing
 _NEAREST_MIDDLE = 0.3  # extents; minimum distance of the look-at point from a view
 
 _REACH = 0.35  # distance over which cameras influence the path, as a fraction of the ellipse's longer half-axis
-_EASE = 0.04  # width of the smoothing of directions, as a fraction of the path
+_EASE = 0.04  # standard deviation of the smoothing of directions, as a fraction of the path
+_SHORT = 0.1  # length of a mean of unit vectors below which they cancel, and the nearest camera's direction is used
+_TINY = 1e-9  # avoids divisions by 0
 
 
 def orbit_cameras(
@@ -99,26 +102,28 @@ def orbit_cameras(
 def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
     """Return the points of the larger parts of an object, [M, 3], without floaters.
 
-    Parts are connected sets of grid cells. If the splats are too scattered, all points are returned.
+    Parts are connected sets of grid cells with two points or more. If the splats are too scattered, all points are
+    returned.
     """
     side = 2 * _CELLS + 1
     with np.errstate(invalid="ignore", over="ignore"):
         places = np.floor(np.clip((cloud.points - frame.centre) / (_CELL * frame.extent), -_CELLS, _CELLS - 1))
     cells = np.ravel_multi_index(tuple(np.nan_to_num(places).astype(np.int64).T + _CELLS), (side,) * 3)
     masses = np.bincount(cells, cloud.masses, side**3)
-    left: Mask = np.bincount(cells, minlength=side**3) > 1
-    kept: Mask = np.zeros_like(left)
-    while left.any():
-        part = _touching(int(np.argmax(np.where(left, masses, -1.0))), left.reshape((side,) * 3)).ravel()
+    unassigned: Mask = np.bincount(cells, minlength=side**3) > 1
+    kept: Mask = np.zeros_like(unassigned)
+    while unassigned.any():
+        heaviest = int(np.argmax(np.where(unassigned, masses, -1.0)))
+        part = _connected_cells(heaviest, unassigned.reshape((side,) * 3)).ravel()
         if not np.sum(masses[part]) > _PART * np.sum(masses):
             break
         kept |= part
-        left &= ~part
+        unassigned &= ~part
     scattered = not np.sum(masses[kept]) > _BODY * np.sum(masses)
     return cloud.points if scattered else cloud.points[kept[cells]]
 
 
-def _touching(first: int, filled: Mask) -> Mask:
+def _connected_cells(first: int, filled: Mask) -> Mask:
     """Return the filled cells, [n, n, n] bool, connected with the cell of flat index `first`."""
     connected: Mask = np.zeros_like(filled)
     connected.flat[first] = True
@@ -133,26 +138,37 @@ def _touching(first: int, filled: Mask) -> Mask:
 
 
 def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
-    """Return a look-at point [3] and a distance at which an object, points [M, 3], is inside all images of an orbit."""
+    """Find the shortest distance at which all images of an orbit show an object, among look-at points on its axis.
+
+    Args:
+        body: [M, 3], the object's points, at least one.
+        frame: the scene's frame; its extent is the distance if the result is not finite or within the near plane.
+        elevation: degrees above the horizon.
+        K: [3, 3], intrinsics.
+        width, height: pixels.
+
+    Returns:
+        [3], the look-at point; the distance from it, scene units.
+    """
     up = frame.up
     first, second = direction_at(up, 0.0, 0.0), direction_at(up, 90.0, 0.0)
-    sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
+    sides = np.stack([_coordinates_along(body - frame.centre, axis) for axis in (first, second, up)])
     low, high = np.quantile(sides, [1.0 - _SHOWN, _SHOWN], axis=1)
     middle, tall = (low + high) / 2.0, float(high[2] - low[2])
     slopes = (1.0 - _MARGIN) * 0.5 * np.array([width / K[0, 0], height / K[1, 1]])
     best: tuple[float, F64] | None = None
     for share in _HEIGHTS:
         x, y, z = sides - (middle + np.array([0.0, 0.0, share * tall]))[:, None]
-        far = 0.0
+        distance = 0.0  # the largest that an azimuth needs
         e = math.radians(elevation)
         for azimuth in np.radians(np.arange(_TURNS) * 360.0 / _TURNS):
             out = x * math.cos(azimuth) + y * math.sin(azimuth)
             across = y * math.cos(azimuth) - x * math.sin(azimuth)
             nearer, above = out * math.cos(e) + z * math.sin(e), z * math.cos(e) - out * math.sin(e)
             needed = nearer + np.maximum(np.abs(across) / slopes[0], np.abs(above) / slopes[1])
-            far = max(far, float(np.quantile(needed, _SHOWN)))
-        if best is None or far < best[0]:
-            best = far, middle + np.array([0.0, 0.0, share * tall])
+            distance = max(distance, float(np.quantile(needed, _SHOWN)))
+        if best is None or distance < best[0]:
+            best = distance, middle + np.array([0.0, 0.0, share * tall])
     assert best is not None
     distance, (x, y, z) = best
     centre = frame.centre + x * first + y * second + z * up
@@ -170,13 +186,14 @@ def _first_view(model: SplatModel) -> Camera | None:
 def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, width: int, height: int) -> list[Camera]:
     """Return cameras on an ellipse around a known camera, looking at a fixed point.
 
-    The ellipse is the widest on which the cameras show enough detail.
+    The ellipse is the widest on which the checked views show enough detail, or the narrowest if there is none.
     """
     ahead, eye = first.viewmat[2, :3], first.position
     depth = max(float(np.sum((frame.centre - eye) * ahead)), frame.extent * _NEAREST_MIDDLE)
     middle, side, near = eye + depth * ahead, first.viewmat[0, :3], min(frame.near, first.near)
 
-    def at(width_degrees: float, turn: float) -> Camera:
+    def swung(width_degrees: float, turn: float) -> Camera:
+        """Return the camera at an angle `turn`, radians, on an ellipse; at a width of 0, where the known one is."""
         aside = math.radians(width_degrees) * math.sin(turn)
         above = math.radians(width_degrees) * _FLATTENED * math.cos(turn)
         way = -ahead + math.tan(aside) * side + math.tan(above) * frame.up
@@ -185,11 +202,12 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 
     turns = 2.0 * math.pi * np.arange(count) / count
     nearest = HIDING * depth
-    good, swing = _GOOD * detail(cloud, at(0.0, 0.0), nearest), 0.0
+    good = _GOOD * detail(cloud, swung(0.0, 0.0), nearest)
+    checks = np.linspace(0.0, 2.0 * math.pi, _SWING_CHECKS)
     for swing in _SWINGS:
-        if min(detail(cloud, at(swing, turn), nearest) for turn in np.linspace(0.0, 2.0 * math.pi, 8)) >= good:
+        if min(detail(cloud, swung(swing, turn), nearest) for turn in checks) >= good:
             break
-    return [at(swing, float(turn)) for turn in turns]
+    return [swung(swing, float(turn)) for turn in turns]
 
 
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
@@ -247,37 +265,37 @@ def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | Non
     rotations = np.stack([camera.viewmat[:3, :3] for camera in cameras])
     positions = np.stack([camera.position for camera in cameras])
     above = -np.mean(rotations[:, 1], axis=0) if up is None else np.array(up, np.float64)
-    above = above / max(float(np.sqrt(np.sum(above**2))), 1e-9)
+    above = above / max(float(np.sqrt(np.sum(above**2))), _TINY)
     middle = positions.mean(axis=0)
     flat = positions - middle
-    flat = flat - _along(flat, above)[:, None] * above
+    flat = flat - _coordinates_along(flat, above)[:, None] * above
     values, axes = np.linalg.eigh(np.mean(flat[:, :, None] * flat[:, None, :], axis=0))
     halves = np.sqrt(2.0 * np.maximum(values[1:], 0.0))  # for points on an ellipse, these are its half-axes
     angles = 2.0 * np.pi * np.arange(count) / count
     plan = np.cos(angles)[:, None] * halves[1] * axes[:, 2] + np.sin(angles)[:, None] * halves[0] * axes[:, 1]
     gaps = np.sum((plan[:, None, :] - flat[None, :, :]) ** 2, axis=2)
-    reach = max(_REACH * float(halves[1]), 1e-9)
+    reach = max(_REACH * float(halves[1]), _TINY)
     weights = np.exp((gaps.min(axis=1, keepdims=True) - gaps) / (2.0 * reach**2))
     weights /= np.sum(weights, axis=1, keepdims=True)
     ahead = _smooth(np.einsum("ij,jk->ik", weights, rotations[:, 2]))
     lengths = np.sqrt(np.sum(ahead**2, axis=1, keepdims=True))
     nearest = rotations[np.argmin(gaps, axis=1), 2]
-    ahead = np.where(lengths > 0.1, ahead / np.maximum(lengths, 1e-9), nearest)
+    ahead = np.where(lengths > _SHORT, ahead / np.maximum(lengths, _TINY), nearest)
     return np.einsum("ij,jk->ik", weights, positions), ahead, above
 
 
 def _smooth(rows: F64) -> F64:
-    """Smooth the rows [N, 3] of a closed path with a Gaussian."""
+    """Return the rows [N, 3] of a closed path, smoothed with a Gaussian of standard deviation `_EASE`; cyclic."""
     count = len(rows)
     steps = np.arange(count)
     gaps = np.minimum(steps, count - steps) / count
     weights = np.exp(-0.5 * (gaps / _EASE) ** 2)
-    turned = weights[(steps[:, None] - steps[None, :]) % count]
-    result: F64 = np.einsum("ij,jk->ik", turned, rows) / np.sum(weights)
+    circulant = weights[(steps[:, None] - steps[None, :]) % count]
+    result: F64 = np.einsum("ij,jk->ik", circulant, rows) / np.sum(weights)
     return result
 
 
-def _along(rows: F64, axis: F64) -> F64:
-    """Return the coordinates of rows [N, 3] along an axis, without BLAS, whose rounding depends on threads."""
+def _coordinates_along(rows: F64, axis: F64) -> F64:
+    """Return the coordinates [N] of rows [N, 3] along a unit axis; without BLAS, whose rounding depends on threads."""
     result: F64 = np.sum(rows * axis, axis=1)
     return result

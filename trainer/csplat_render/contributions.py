@@ -179,6 +179,7 @@ class Contributions(Rasteriser):
         place[rows] = np.arange(len(rows), dtype=np.int32)
         drawn = np.take(shape, rows, axis=0)
         np.minimum(drawn[:, 6:9], _MAX_COLOUR, out=drawn[:, 6:9])
+        # The exponent of 2 at which alpha, opacity · 2**exponent, falls below the minimum.
         drawn[:, 9] = np.log2(self._alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
         return ProjectedView(
             rows=rows,
@@ -289,7 +290,15 @@ class Contributions(Rasteriser):
 
 @parallel_kernel()
 def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
-    """Evaluate the SH basis in the direction of each drawn splat; parallel over blocks of splats."""
+    """Evaluate the SH basis in the direction of each drawn splat; parallel over blocks of splats.
+
+    Args:
+        means: [N, 3].
+        rows: [V] int32, indices of the drawn splats.
+        view: see `view_vector`.
+        degree: highest SH degree.
+        basis: [V, B], written; B is (degree + 1)² or 0.
+    """
     values = np.empty(BASIS_SIZE, np.float64)
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
@@ -303,7 +312,13 @@ def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degr
 def set_colours(
     lane: int, lanes: int, rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any
 ) -> None:
-    """Write colours, offset + Y · coefficients if active, else 0, into the shapes; parallel over blocks of splats."""
+    """Write colours, offset + Y · coefficients if active, else 0, into the shapes; parallel over blocks of splats.
+
+    Args:
+        rows, basis: see `ProjectedView`.
+        coefficients, active, offset: see `Contributions.backproject`.
+        shape: [V, 10], columns 6 to 8 are written.
+    """
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
@@ -315,7 +330,7 @@ def set_colours(
 
 @device_function
 def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
-    """Return basis [B] · coefficients [B, 3], float64."""
+    """Return the products basis [B] · coefficients [B, 3], red, green, blue, summed in float64."""
     r, g, b = 0.0, 0.0, 0.0
     for k in range(basis.shape[0]):
         y = np.float64(basis[k])
@@ -327,7 +342,13 @@ def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
 
 @parallel_kernel()
 def add_pruning_sums(lane: int, lanes: int, rows: Any, first: Any, records: Any, errors: Any, seen: Any) -> None:
-    """Add the records of a view to the sums of `Contributions.measure_pruning`; parallel over blocks of splats."""
+    """Add the records of a view to the sums of `Contributions.measure_pruning`; parallel over blocks of splats.
+
+    Args:
+        rows, first: see `ProjectedView`.
+        records: [intersections, PRUNING_SUMS], from `sum_pruning`.
+        errors, seen: [N], modified; splats of weight 0 in the view keep their values.
+    """
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             error, weight = 0.0, 0.0
@@ -360,14 +381,14 @@ def add_gradient(
                 continue
             r, g, b = r if active[j, 0] else 0.0, g if active[j, 1] else 0.0, b if active[j, 2] else 0.0
             r32, g32, b32 = np.float32(r), np.float32(g), np.float32(b)
-            own, to = basis[j], gradient[rows[j]]
+            harmonics, sums = basis[j], gradient[rows[j]]
             for k in range(basis.shape[1]):
-                to[k, 0] += own[k] * r32
-                to[k, 1] += own[k] * g32
-                to[k, 2] += own[k] * b32
+                sums[k, 0] += harmonics[k] * r32
+                sums[k, 1] += harmonics[k] * g32
+                sums[k, 2] += harmonics[k] * b32
             if with_diagonal:
                 for k in range(basis.shape[1]):
-                    diagonal[rows[j], k] += squares * own[k] * own[k]
+                    diagonal[rows[j], k] += squares * harmonics[k] * harmonics[k]
 
 
 #: Numbers per record.

@@ -75,7 +75,10 @@ _failures: list[str] = []  # reasons why numba's cache could not be used
 
 
 def _compile(function: Any, **options: Any) -> Any:
-    """Compile a function with numba, and keep the result on disk if possible."""
+    """Return a function that numba compiles at its first call for each signature, and keeps on disk if possible.
+
+    If there is no folder for the cache, the reason is added to `_failures`.
+    """
     compiled = numba.njit(function, nogil=True, error_model="numpy", **options)
     try:
         compiled._cache = _KernelCache(function)  # noqa: SLF001  # `cache=True` raises if there is no folder
@@ -203,6 +206,7 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types 
         self._call, self._called = call, False
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002  # numba's
+        """Call the function, unless it was called before."""
         if not self._called:
             self._called = True
             self._call()
@@ -224,15 +228,17 @@ def fast_exp2(x: float) -> float:
 
 
 def _fast_exp2(x: Any) -> Callable[[Any], Any]:
-    """Return the implementation of `fast_exp2` for a type of numba."""
+    """Return the implementation of `fast_exp2` for a type of numba: a polynomial for float32, else exp."""
 
     def exact(x: Any) -> Any:
+        """Return 2**x."""
         return math.exp(x * _LN2)
 
     if x != numba.types.float32:
         return exact
 
-    lowest, half = np.float32(-120.0), np.float32(0.5)
+    lowest = np.float32(-120.0)  # smaller x count as this, so that the result's exponent does not underflow
+    half = np.float32(0.5)
     # 2**x = 2**n · 2**f with n an integer and |f| <= 1/2; 2**f = Σ c_k f**k, fitted for minimal relative error.
     c0, c1, c2 = np.float32(1.0000001353333114), np.float32(0.6931468253392489), np.float32(0.24021906575261626)
     c3, c4, c5 = np.float32(0.05550791318132806), np.float32(0.009684186484357147), np.float32(0.0013275470569714626)
@@ -302,7 +308,7 @@ class _HelperThread:
         threading.Thread(target=self._serve, name="csplat kernel", daemon=True).start()
 
     def start(self, function: Any, arguments: tuple[Any, ...]) -> None:
-        """Start a call."""
+        """Start a call; `wait` must be called before the next."""
         self._job = function, arguments
         self._begun.release()
 
@@ -314,7 +320,7 @@ class _HelperThread:
             raise error
 
     def _serve(self) -> None:
-        """Make the calls, one after the other, for ever."""
+        """Make the calls of `start` one after the other, for ever, and keep the exception of each for `wait`."""
         while True:
             self._begun.acquire()
             function, arguments = self._job
@@ -335,7 +341,12 @@ class _ThreadPool:
         self._helpers: list[_HelperThread] = []
 
     def run(self, function: Any, arguments: tuple[Any, ...]) -> None:
-        """Call `function(lane, lanes, *arguments)` for every lane."""
+        """Call `function(lane, lanes, *arguments)` for every lane, lane 0 on this thread, and wait for all.
+
+        The number of lanes is `limit`; without a limit, all available threads, or 1 if the arrays are small. Missing
+        helpers are started. An exception of a lane is raised after all lanes have ended; a second interrupt
+        ends the wait.
+        """
         lanes = self.limit or (1 if _bytes_of(arguments) < _SERIAL_BYTES else available_threads())
         while len(self._helpers) < lanes - 1:
             self._helpers.append(_HelperThread())
@@ -348,15 +359,15 @@ class _ThreadPool:
             while waiting:
                 waiting.pop().wait()
         except Exception:
-            self._quit(waiting)
+            self._await_lanes(waiting)
             raise
         except BaseException:
-            self._quit(waiting)
+            self._await_lanes(waiting)
             self.forget()  # a started helper may be missing in `waiting`: use new threads next time
             raise
 
-    def _quit(self, waiting: list[_HelperThread]) -> None:
-        """Wait for lanes that still write into the buffers, ignoring further errors."""
+    def _await_lanes(self, waiting: list[_HelperThread]) -> None:
+        """Wait for lanes that still write into the buffers, ignoring their errors; empties `waiting`."""
         try:
             while waiting:
                 with suppress(Exception):
@@ -371,7 +382,7 @@ class _ThreadPool:
 
 
 def _bytes_of(arguments: tuple[Any, ...]) -> int:
-    """Return the size of all arrays together."""
+    """Return the size of all arrays among the arguments, bytes."""
     return sum(argument.nbytes for argument in arguments if isinstance(argument, np.ndarray))
 
 

@@ -41,7 +41,7 @@ ENVIRONMENT = "CSPLAT_LPIPS"
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 
-_EPSILON = 1e-10
+_EPSILON = 1e-10  # added to the length of a pixel's features, as in the lpips package, so that 0 stays 0
 
 # Kernel (height, width, in, out), stride, padding, max-pooling before the convolution.
 _LAYERS = (
@@ -98,7 +98,9 @@ class Lpips:
             raise InputError(f"LPIPS requires images of at least {MIN_SIZE}×{MIN_SIZE} pixels")
         distance = 0.0
         for a, b, head in zip(_features(reference, self), _features(image, self), self.heads, strict=True):
-            distance += float(np.mean(np.square(_unit(a) - _unit(b)) @ head.astype(np.float64)))
+            distance += float(
+                np.mean(np.square(_normalise_channels(a) - _normalise_channels(b)) @ head.astype(np.float64))
+            )
         return distance
 
 
@@ -112,13 +114,13 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
         InputError: the file does not contain weights, or none are found.
     """
     if path is not None:
-        return _read(Path(path))
+        return _read_weights(Path(path))
     if named := os.environ.get(ENVIRONMENT):
-        return _read(Path(named))
+        return _read_weights(Path(named))
     # Path.home() raises if there is no home; this leaves the ~.
     cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "csplat", "lpips_alex.npz")  # noqa: PTH111
     if cache.is_file():
-        return _read(cache)
+        return _read_weights(cache)
     weights = load_torch_lpips()
     if weights is None:
         raise InputError(
@@ -138,19 +140,23 @@ def save_lpips(path: str | Path, weights: Lpips) -> None:
     np.savez(path, **arrays)
 
 
-def _read(path: Path) -> Lpips:
-    """Read the weights from an .npz file; raise an `InputError` if it does not contain them."""
-    count = range(len(_LAYERS))
+def _read_weights(path: Path) -> Lpips:
+    """Read the weights from an .npz file in the layout of `save_lpips`.
+
+    Raises:
+        InputError: the file cannot be read, or an array is missing, not of finite floats or of another shape.
+    """
+    layers = range(len(_LAYERS))
     try:
         file = read_archive(path, "a file of LPIPS weights (.npz)")
     except OSError as error:
         raise InputError(f"LPIPS weights {path}: {error.strerror or error}") from error
     names = ("AlexNet_0/Conv_{}/kernel", "AlexNet_0/Conv_{}/bias", "NetLinLayer_{}/Conv_0/kernel")
-    parts = [[file[name.format(i)] for i in count] for name in names]
-    if any(array.dtype.kind != "f" for part in parts for array in part):
+    groups = [[file[name.format(i)] for i in layers] for name in names]
+    if any(array.dtype.kind != "f" for group in groups for array in group):
         file.refuse("its arrays do not contain floating-point numbers")
     with np.errstate(over="ignore"):  # values beyond float32 are refused as not finite
-        kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
+        kernels, biases, heads = (tuple(array.astype(np.float32) for array in group) for group in groups)
     return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
 
@@ -189,7 +195,7 @@ def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) 
 
 
 def _heads_path() -> Path | None:
-    """Return the path of the linear heads in an installed package."""
+    """Return the path of the linear heads in an installed `lpips` or `torchmetrics`; `None` if there is none."""
     for package, inside in (
         ("lpips", "weights/v0.1/alex.pth"),
         ("torchmetrics", "functional/image/lpips_models/alex.pth"),
@@ -201,25 +207,33 @@ def _heads_path() -> Path | None:
 
 
 def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
-    """Return the features after each of AlexNet's five convolutions, [h, w, channels] each."""
+    """Return the features after each of AlexNet's five convolutions and its ReLU.
+
+    Args:
+        image: [H, W, 3], clipped to 0..1.
+        weights: the network.
+
+    Returns:
+        [h, w, channels] each.
+    """
     from csplat_render.metric_kernels import convolve  # numba takes a second to import
 
     x: F32 = (np.clip(image.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
     features = []
     for (_, stride, padding, pooled), kernel, bias in zip(_LAYERS, weights.kernels, weights.biases, strict=True):
-        x = np.maximum(convolve(_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
+        x = np.maximum(convolve(_max_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
         features.append(x)
     return features
 
 
-def _unit(x: F32) -> NDArray[np.float64]:
-    """Scale the channels of each pixel to length 1, [h, w, channels]."""
+def _normalise_channels(x: F32) -> NDArray[np.float64]:
+    """Return features [h, w, channels] in float64, those of each pixel scaled to length 1; 0 stays 0."""
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result
 
 
-def _pool(x: F32) -> F32:
+def _max_pool(x: F32) -> F32:
     """Return the maximum over 3×3 pixels of [h, w, channels], with a stride of 2."""
     result: F32 = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
     return result

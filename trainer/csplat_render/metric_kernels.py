@@ -28,11 +28,12 @@ RADIUS = 5  #: pixels from the centre of the window to its edge
 
 CHANNELS = 3  #: values per pixel, adjacent in a row
 
-_SIGMA = 1.5
-_PAD = CHANNELS * RADIUS
+_SIGMA = 1.5  # pixels
+_PAD = CHANNELS * RADIUS  # values of zero on either side of a row
 
 
 def _window() -> F64:
+    """Return the weights of `WINDOW`."""
     taps = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2.0 * _SIGMA**2))
     normalised: F64 = taps / taps.sum()
     return normalised
@@ -53,7 +54,7 @@ def mean_ssim(x: F64, y: F64) -> float:
     sums = np.empty(height, np.float64)
     with thread_count(None):
         blur_products(x.reshape(height, width), y.reshape(height, width), WINDOW[RADIUS:], across)
-        _similarities(across, WINDOW[RADIUS:], sums)
+        _sum_ssim_of_rows(across, WINDOW[RADIUS:], sums)
     return float(sums.sum()) / x.size
 
 
@@ -125,7 +126,7 @@ def blur_products(lane: int, lanes: int, x: Any, y: Any, taps: Any, across: Any)
 
 
 @parallel_kernel(relaxed=True)
-def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> None:
+def _sum_ssim_of_rows(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> None:
     """Sum SSIM over each row; parallel over rows, vectorised over the values of a row.
 
     Args:
@@ -138,11 +139,11 @@ def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> N
     for r in range(lane, len(sums), lanes):
         for f in range(5):
             blur_down(across[f], r, taps, moments[f])
-        m1, m2, e11, e22, e12 = moments[0], moments[1], moments[2], moments[3], moments[4]
+        mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments[0], moments[1], moments[2], moments[3], moments[4]
         total = 0.0
         for i in range(width):
-            mx, my = m1[i], m2[i]
-            xx, yy, xy = e11[i] - mx * mx, e22[i] - my * my, e12[i] - mx * my
+            mx, my = mean_x[i], mean_y[i]
+            xx, yy, xy = mean_xx[i] - mx * mx, mean_yy[i] - my * my, mean_xy[i] - mx * my  # σx², σy², σxy
             total += (2.0 * mx * my + C1) * (2.0 * xy + C2) / ((mx * mx + my * my + C1) * (xx + yy + C2))
         sums[r] = total
 

@@ -106,8 +106,8 @@ class Scores:
             psnr_mean=math.fsum(view.psnr for view in each) / len(each),
             psnr_worst=each[worst].psnr,
             worst_view=worst,
-            ssim=_mean([view.ssim for view in each]),
-            lpips=_mean([view.lpips for view in each]),
+            ssim=_mean_of_known([view.ssim for view in each]),
+            lpips=_mean_of_known([view.lpips for view in each]),
             psnr_covered=psnr_of_mse(missed / math.fsum(covered)) if any(covered) else None,
             cover=math.fsum(covered) / sum(pixels) if known else None,
             ignored=ignored,
@@ -177,7 +177,7 @@ def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
 
 def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
     """Return the squared difference of two images, [H, W, 3] float64, both clipped to [0, 1]."""
-    a, b = _clip(reference, image)
+    a, b = _clipped_pair(reference, image)
     result: F64 = (a - b) ** 2
     return result
 
@@ -198,20 +198,20 @@ def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
     """Return the SSIM of two images, [H, W, 3] each; 1 if they are equal."""
     from csplat_render.metric_kernels import mean_ssim  # numba takes a second to import
 
-    return mean_ssim(*_clip(reference, image))
+    return mean_ssim(*_clipped_pair(reference, image))
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def _mean_of_known(values: Sequence[float | None]) -> float | None:
     """Return the mean of the known values; `None` if there are none."""
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
 
 
-def _clip(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
-    """Return two images, [H, W, 3] float64, clipped to 0..1.
+def _clipped_pair(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
+    """Return two images as [H, W, 3] float64, C-contiguous, clipped to 0..1; infinities become 0 or 1.
 
     Raises:
-        InputError: an image has another shape or dtype or contains NaN, or the shapes differ.
+        InputError: an image is not [H, W, 3] or has no pixels, is not of floats or contains NaN, or the shapes differ.
     """
     for name, array in (("reference", reference), ("image", image)):
         if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:

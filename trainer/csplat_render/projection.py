@@ -63,6 +63,8 @@ sh_basis_gradient = device_function(spherical_harmonics.sh_basis_gradient)
 #: Number of splats that a thread processes at a time.
 BLOCK = 512
 
+_REACH_MARGIN = 1e-6  # relative, and in standard deviations
+
 
 @device_function
 def rotation_matrix(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
@@ -252,10 +254,10 @@ def project(
             reach = 2.0 * math.log(opacity / alpha_min)
             # Early rejection: |u|² ≤ (max s)² |p|², |v|² ≤ (max s)² |q|².
             longest = max(s0, s1, s2)
-            longest *= longest
+            longest_squared = longest * longest
             most_a, most_c = p0 * p0 + p1 * p1 + p2 * p2, q0 * q0 + q1 * q1 + q2 * q2
-            if is_outside(px, width, reach * (longest * most_a + DILATION)) or is_outside(
-                py, height, reach * (longest * most_c + DILATION)
+            if is_outside(px, width, reach * (longest_squared * most_a + DILATION)) or is_outside(
+                py, height, reach * (longest_squared * most_c + DILATION)
             ):
                 bad += not is_finite_colour(i, sh0, shN, higher)
                 continue
@@ -280,7 +282,7 @@ def project(
                 bad += not is_finite_colour(i, sh0, shN, higher)
                 continue
             # ρ, slightly enlarged so that rounding never loses a pixel.
-            reach = math.sqrt(reach) * (1.0 + 1e-6) + 1e-6
+            reach = math.sqrt(reach) * (1.0 + _REACH_MARGIN) + _REACH_MARGIN
             root_a, root_c = math.sqrt(A), math.sqrt(C)
             rx, ry = reach * root_a, reach * root_c
             x0 = math.ceil(min(max(px - rx - 0.5, 0.0), np.float64(width)))
@@ -322,7 +324,7 @@ _MAX_GRADIENT = 1e37  # gradients are clamped to ± this so that sums of them fi
 
 @device_function
 def _clamp(value: float) -> float:
-    """Clamp a gradient to ± `_MAX_GRADIENT`; NaN becomes 0."""
+    """Return a gradient clamped to ± `_MAX_GRADIENT`; 0 for NaN."""
     if not (abs(value) <= _MAX_GRADIENT):
         if value > 0.0:
             return _MAX_GRADIENT

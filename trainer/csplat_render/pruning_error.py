@@ -107,6 +107,7 @@ def pruning_error_exact(
     errors = np.zeros(len(rows))
 
     def render(splats: SplatModel, camera: Camera) -> Array:
+        """Return the render of some of the splats, [H, W, 3] float64, with the settings of the whole scene."""
         return render_exact(
             splats,
             camera,
@@ -116,8 +117,8 @@ def pruning_error_exact(
         ).rgb
 
     for camera in cameras:
-        whole = render(model, camera)
+        complete = render(model, camera)
         for place, row in enumerate(rows):
-            rest = model.select(np.delete(np.arange(len(model)), row))
-            errors[place] += float(np.sum((render(rest, camera) - whole) ** 2))
+            others = model.select(np.delete(np.arange(len(model)), row))
+            errors[place] += float(np.sum((render(others, camera) - complete) ** 2))
     return errors

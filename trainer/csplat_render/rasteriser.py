@@ -51,7 +51,7 @@ _MANY_TILES = 1 << 16  # tiles
 
 @dataclass(frozen=True, eq=False)
 class _ForwardState:
-    """Arguments and results of the last `forward`, for `backward`."""
+    """Arguments and results of the last `forward`, for `backward`, which also reads the buffers that it filled."""
 
     splats: UncheckedSplats
     view: Array
@@ -225,7 +225,11 @@ class Rasteriser:
     def _project(
         self, splats: UncheckedSplats, camera: Camera, degree: int, *, antialiased: bool
     ) -> tuple[Array, Array, int]:
-        """Fill the buffers shape, extent, box and near; return view, radii [N] and the number of ignored splats."""
+        """Project the splats into the buffers shape, extent, box and near, see `project`.
+
+        Returns:
+            [24], see `view_vector`; [N] float32, radii in pixels, see `RenderResult`; the number of ignored splats.
+        """
         n, view = len(splats.means), view_vector(camera)
         ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
         project(
@@ -237,7 +241,11 @@ class Rasteriser:
         return view, radii, int(ignored.sum())
 
     def _depth_order(self, near: Array) -> Array:
-        """Return the indices of the drawn splats, nearest first, by their depths `near` [N], 0 for others."""
+        """Return the indices [V] int32 of the drawn splats, nearest first; the next call overwrites them.
+
+        Args:
+            near: [N] float32, depths; 0 for splats that are not drawn.
+        """
         n = len(near)
         order = self._buffer("order", (n,), np.int32)
         count = depth_order(
@@ -292,13 +300,18 @@ class Rasteriser:
         return starts, total
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any) -> Array:
-        """Return an array in reused memory, which grows by at least a quarter."""
+        """Return an array in the memory of a name, reused from call to call, and store it as `_buffers[name]`.
+
+        Its values are the last ones in that memory; they are undefined after the memory grew, by at least a quarter, or
+        changed its dtype.
+        """
         size = math.prod(shape)  # faster than np.prod
-        store = self._buffers.get(name + "*")
+        memory_name = name + "*"  # the memory itself, of which the array is a view
+        store = self._buffers.get(memory_name)
         if store is None or store.size < size or store.dtype != dtype:
             larger = 0 if store is None else store.size * 5 // 4
             store = np.empty(max(size, larger), dtype)
-            self._buffers[name + "*"] = store
+            self._buffers[memory_name] = store
         view = store[:size].reshape(shape)
         self._buffers[name] = view
         return view

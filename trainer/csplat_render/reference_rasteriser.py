@@ -93,7 +93,13 @@ def render_exact(
 def _project(
     splats: HasSplats, camera: Camera, degree: int, antialiased: bool, decisions: Decisions
 ) -> tuple[Array, dict[str, Array], int]:
-    """Return the indices [n] of splats in front of the camera, nearest first; their projections; the ignored count."""
+    """Project the splats in front of the near plane.
+
+    Returns:
+        [n], their indices, nearest first, or in the recorded order. Their projections: `centre` [n, 2], pixels;
+        `covariance` [n, 2, 2], square pixels, with its inverse (a b; b c), `a`, `b`, `c` [n]; `opacity` and `depth`
+        [n]; `colour` [n, 3]. The number of splats with NaN or infinity, which are ignored.
+    """
     coefficients = np.concatenate([splats.sh0[:, None], splats.shN[:, : (degree + 1) ** 2 - 1]], 1, dtype=np.float64)
     arrays = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], coefficients]
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], axis=0)
@@ -112,7 +118,7 @@ def _project(
     opacity = opacities[order, 0]
 
     # Σ = M Mᵀ with M = rotation · diag(s); its image under the linearised perspective is (J R M) (J R M)ᵀ.
-    w, i, j, k = _unit(quats[order]).T
+    w, i, j, k = _unit_quats(quats[order]).T
     rotation = np.array(
         [
             [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)],
@@ -154,7 +160,8 @@ def _project(
     return index[order], drawn, int(np.count_nonzero(~finite))
 
 
-def _unit(quats: Array) -> Array:
+def _unit_quats(quats: Array) -> Array:
+    """Return quats [n, 4] of unit length; the identity for length 0."""
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(length > 0.0, quats / length, [1.0, 0.0, 0.0, 0.0])
 
@@ -172,25 +179,29 @@ def _clamp_tangent(tangent: Array, focal: float, centre: float, size: int, decis
 def _blend(
     drawn: dict[str, Array], camera: Camera, transmittance_min: float, decisions: Decisions
 ) -> tuple[Array, Array, Array]:
-    """Return colour [H, W, 3], transmittance [H, W] and depth [H, W]."""
+    """Blend the splats of `_project` front to back, `_CHUNK` at a time.
+
+    Returns:
+        [H, W, 3], colour without background; [H, W], transmittance; [H, W], sum of weight · depth.
+    """
     ys, xs = np.mgrid[: camera.H, : camera.W].reshape(2, -1) + 0.5
     before = np.ones(len(xs))
     rgb, depth = np.zeros((len(xs), 3)), np.zeros(len(xs))
-    going = np.ones(len(xs), bool)
+    unfinished = np.ones(len(xs), bool)
     for start in range(0, len(drawn["depth"]), _CHUNK):
-        part = {name: values[start : start + _CHUNK, None] for name, values in drawn.items()}
-        dx, dy = xs - part["centre"][..., 0], ys - part["centre"][..., 1]
-        power = -0.5 * (part["a"] * dx * dx + 2.0 * part["b"] * dx * dy + part["c"] * dy * dy)
-        alpha = part["opacity"] * np.exp(np.minimum(power, 0.0))
+        chunk = {name: values[start : start + _CHUNK, None] for name, values in drawn.items()}
+        dx, dy = xs - chunk["centre"][..., 0], ys - chunk["centre"][..., 1]
+        power = -0.5 * (chunk["a"] * dx * dx + 2.0 * chunk["b"] * dx * dy + chunk["c"] * dy * dy)
+        alpha = chunk["opacity"] * np.exp(np.minimum(power, 0.0))
         alpha = np.where(decisions.ask(alpha < ALPHA_CAP), alpha, ALPHA_CAP)
         alpha = np.where(decisions.ask(alpha >= ALPHA_MIN), alpha, 0.0)
         after = before * np.cumprod(1.0 - alpha, axis=0)
-        seen = decisions.ask(going & (after >= transmittance_min))
+        seen = decisions.ask(unfinished & (after >= transmittance_min))
         through = np.concatenate([before[None], after[:-1]])
         weight = np.where(seen, alpha * through, 0.0)
-        rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])
-        depth += (weight * part["depth"]).sum(0)
+        rgb += np.einsum("sp,sc->pc", weight, chunk["colour"][:, 0])
+        depth += (weight * chunk["depth"]).sum(0)
         count = seen.sum(0)  # a finished pixel stays finished, so the first `count` splats are blended
         before = np.where(count > 0, np.take_along_axis(after, np.maximum(count - 1, 0)[None], 0)[0], before)
-        going = seen[-1]
+        unfinished = seen[-1]
     return rgb.reshape(camera.H, camera.W, 3), before.reshape(camera.H, camera.W), depth.reshape(camera.H, camera.W)

@@ -26,6 +26,9 @@ _MAX_LOG_SCALE = 60.0  # fourth powers of larger scales overflow
 _NEAR = 0.05  # near plane, extents; at most DEFAULT_NEAR
 _FAR_REACH = 4.0  # radius of an object, in radii of the sphere that contains half the opacity
 _FAR_SHARE = 0.02  # fraction of the surface; if more is outside this radius, the scene is surroundings
+_BOX_QUANTILES = (0.05, 0.5, 0.95)  # of opacity along an axis: the box and its middle
+_AREA_REACH = 0.5  # side of the largest area of a splat that counts, in radii that contain half the opacity
+_SINGLE_EXTENT = 3.0  # extent of splats at a single position, in standard deviations of the largest
 _FLAT = 0.6  # ratio of the shortest extent to the next; if it is smaller, the short axis points up
 
 Kind = Literal["object", "surrounding"]
@@ -84,17 +87,17 @@ def scene_frame(model: SplatModel) -> SceneFrame:
         return SceneFrame("object", np.zeros(3), 1.0, np.array([0.0, -1.0, 0.0]))
     alpha, areas = visible_opacity(model), surface_areas(model)
     means = model.means.astype(np.float64)
-    low, middle, high = np.stack([weighted_quantiles(means[:, k], alpha, (0.05, 0.5, 0.95)) for k in range(3)], axis=1)
+    low, middle, high = np.stack([weighted_quantiles(means[:, k], alpha, _BOX_QUANTILES) for k in range(3)], axis=1)
     half = (high - low) / 2.0
     up = _up(model, half)
     distances = np.sqrt(np.sum((means - middle) ** 2, axis=1))
     reach = float(weighted_quantiles(distances, alpha, (0.5,))[0])
-    surface = alpha * np.minimum(areas, (0.5 * reach) ** 2)  # limited so that no floater outweighs a scene
+    surface = alpha * np.minimum(areas, (_AREA_REACH * reach) ** 2)  # limited so that no floater outweighs a scene
     if np.sum(surface[distances > _FAR_REACH * reach]) > _FAR_SHARE * np.sum(surface):
         return SceneFrame("surrounding", middle, reach, up)
     extent = float(np.sqrt(np.sum(half**2)))
     if extent <= 0.0:  # a single position
-        extent = 3.0 * float(np.sqrt(np.max(areas[alpha > 0.0]) / (2.0 * np.pi)))
+        extent = _SINGLE_EXTENT * float(np.sqrt(np.max(areas[alpha > 0.0]) / (2.0 * np.pi)))
     return SceneFrame("object", (low + high) / 2.0, extent, up)
 
 
@@ -153,9 +156,9 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
     mass = (alpha + alpha**2 / 4.0 + alpha**3 / 9.0 + alpha**4 / 16.0) * areas
     chance = np.sqrt(mass)
     sums = np.cumsum(chance)
-    at = (np.arange(count) + rng.random()) / count * sums[-1]
+    levels = (np.arange(count) + rng.random()) / count * sums[-1]
     last = int(np.flatnonzero(chance).max(initial=0))  # rounding must not go beyond it
-    index = np.minimum(np.searchsorted(sums, at, side="right"), last)
+    index = np.minimum(np.searchsorted(sums, levels, side="right"), last)
     s = np.exp(_clipped_scales(model)[index])
     offsets = _rotate(model.quats[index].astype(np.float64), rng.standard_normal((count, 3)) * s)
     # The mass of a splat divided by its expected number of points is chance · sums[-1] / count.
@@ -230,7 +233,15 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
 
 
 def _up(model: SplatModel, half: F64) -> F64:
-    """Return the scene's own up direction [3], else the short axis of a flat scene, else −y, the default of PLY."""
+    """Return the scene's own up direction, else the short axis of a flat scene (+x, −y or +z), else −y.
+
+    Args:
+        model: the scene.
+        half: [3], half the size of the scene's box along each axis, scene units.
+
+    Returns:
+        [3], unit length.
+    """
     stored = model.metadata.up
     if stored is not None:
         direction: F64 = np.array(stored)
@@ -244,6 +255,7 @@ def _up(model: SplatModel, half: F64) -> F64:
 
 
 def _cell_count(camera: Camera, cell: int) -> int:
+    """Return the number of cells of an image; those at its right and lower edge may be smaller than `cell` pixels."""
     return -(-camera.W // cell) * -(-camera.H // cell)
 
 
@@ -272,11 +284,12 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
 
 
 def _clipped_scales(model: SplatModel) -> F64:
+    """Return the log scales [N, 3], limited to ± `_MAX_LOG_SCALE`."""
     return np.clip(model.scales.astype(np.float64), -_MAX_LOG_SCALE, _MAX_LOG_SCALE)
 
 
 def _rotate(q: F64, v: F64) -> F64:
-    """Rotate vectors [N, 3] by quaternions [N, 4] (w x y z, nearly unit)."""
+    """Return vectors [N, 3] rotated by quaternions [N, 4] (w x y z, nearly of unit length)."""
     w, u = q[:, :1], q[:, 1:]
     t = 2.0 * np.cross(u, v)
     result: F64 = v + w * t + np.cross(u, t)

@@ -228,5 +228,6 @@ def renderer(
 
 
 def _render_reference(render: Callable[[Camera], Render], camera: Camera) -> ReferenceImage:
+    """Render a view of the source as its reference, with the cover but without a mask."""
     result = render(camera)
     return ReferenceImage(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)

@@ -18,9 +18,11 @@ from csplat_render.virtual_cameras import FIELD_OF_VIEW
 
 _UP_CERTAIN = 0.3  # minimum length of a conclusive sum
 _UP_NEAR_AXIS = 0.9  # minimum cosine with an axis: programs use one of their axes as up
-_UP_POINTS, _UP_DIRECTIONS, _UP_IMAGE_SIZE = 10_000, 32, 320
-_UP_DISTANCE = 2.0  # extents
-_UP_CELL, _UP_FINE = 20, 2.0  # pixels
+_UP_POINTS = 10_000  # cloud points
+_UP_DIRECTIONS = 32  # number of views
+_UP_IMAGE_SIZE = 320  # pixels, width and height of the views
+_UP_DISTANCE = 2.0  # extents, from the centre
+_UP_CELL, _UP_FINE = 20, 2.0  # pixels, see `detail`
 
 
 def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
@@ -42,10 +44,10 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
     K = intrinsics(_UP_IMAGE_SIZE, _UP_IMAGE_SIZE, FIELD_OF_VIEW)
     heights = 1.0 - (2.0 * np.arange(_UP_DIRECTIONS) + 1.0) / _UP_DIRECTIONS  # spiral that covers the sphere evenly
     turns, radii = np.pi * (1.0 + 5.0**0.5) * np.arange(_UP_DIRECTIONS), np.sqrt(1.0 - heights**2)
-    ways = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights], axis=1)
+    directions = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights], axis=1)
     details = np.empty(_UP_DIRECTIONS)
-    for i, way in enumerate(ways):
-        eye, across = frame.centre + _UP_DISTANCE * frame.extent * way, np.eye(3)[np.argmin(np.abs(way))]
+    for i, direction in enumerate(directions):
+        eye, across = frame.centre + _UP_DISTANCE * frame.extent * direction, np.eye(3)[np.argmin(np.abs(direction))]
         details[i] = detail(
             cloud,
             look_at(eye, frame.centre, across, K, _UP_IMAGE_SIZE, _UP_IMAGE_SIZE, frame.near),
@@ -54,7 +56,8 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
             fine=_UP_FINE,
         )
     total = float(np.sum(details))
-    sums = 3.0 * np.sum(details[:, None] * ways, axis=0) / total if total > 0.0 else np.zeros(3)
+    # The factor 3 gives length 1 if detail is proportional to 1 + the cosine with the up axis.
+    sums = 3.0 * np.sum(details[:, None] * directions, axis=0) / total if total > 0.0 else np.zeros(3)
     axis = int(np.argmax(np.abs(sums)))
     if not abs(sums[axis]) >= max(_UP_CERTAIN, _UP_NEAR_AXIS * float(np.sqrt(np.sum(sums**2)))):
         return None

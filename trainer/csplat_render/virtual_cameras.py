@@ -51,6 +51,9 @@ _PROMISING = 4  # number of directions in which nearer cameras are tried
 _TARGET_OFFSET = 0.05  # extents; maximum distance of the look-at point from an object's centre along each axis
 _CLEAR_RADIUS = 0.32  # radius around a camera that must be clear, as a fraction of its distance from the centre
 _CLEAR_SHARE = 0.01  # maximum fraction of an object's surface within this radius
+_HOPELESS = 0.8  # fraction of the needed cover; distances whose predicted cover is below it are not tried
+_SECTOR_STEPS = (0.0, 1.0 / 3.0, -1.0 / 3.0)  # azimuths to try in a sector, from its middle, as fractions of its width
+_EMPTY_DISTANCE = 2.2  # extents; from the centre of an empty scene
 _GOOD_DETAIL = 0.65  # minimum detail, as a fraction of the best view's
 _AZIMUTH_STEP = 15.0  # degrees
 _POINTS = 60_000  # cloud points
@@ -90,7 +93,7 @@ def virtual_cameras(
     begin = 360.0 * float(rng.random())
     if len(model) == 0:
         K = intrinsics(width, height, FIELD_OF_VIEW)
-        return orbit(frame.centre, 2.2, frame.up, count, K, width, height, near=frame.near)
+        return orbit(frame.centre, _EMPTY_DISTANCE, frame.up, count, K, width, height, near=frame.near)
     cloud = sample_cloud(model, _POINTS, rng, every)
     K = intrinsics(width, height, FIELD_OF_VIEW)
     camera_at = partial(frame.camera_at, K=K, width=width, height=height)
@@ -102,16 +105,23 @@ def virtual_cameras(
 def _around_object(
     frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, count: int, begin: float, rng: np.random.Generator
 ) -> list[Camera]:
-    """Place a camera in each of `count` equal sectors, at the largest distance at which the cover is sufficient."""
+    """Place a camera in each of `count` equal sectors, by `_object_view`.
+
+    Args:
+        frame: the scene's frame.
+        camera_at: `frame.camera_at` for the image.
+        cloud: points of the scene.
+        count: number of cameras.
+        begin: azimuth of the middle of the first sector, degrees.
+        rng: determines the look-at points.
+    """
     width = 360.0 / count
     cameras = []
     for sector in range(count):
         offset = _TARGET_OFFSET * (2.0 * rng.random(3) - 1.0)
         elevations = np.roll(_OBJECT_ELEVATIONS, -sector)
         angles = [
-            (begin + (sector + step) * width, float(elevation))
-            for elevation in elevations
-            for step in (0.0, 1.0 / 3.0, -1.0 / 3.0)
+            (begin + (sector + step) * width, float(elevation)) for elevation in elevations for step in _SECTOR_STEPS
         ]
         cameras.append(_object_view(frame, camera_at, cloud, angles, offset))
     return cameras
@@ -120,12 +130,20 @@ def _around_object(
 def _object_view(
     frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, angles: list[tuple[float, float]], offset: F64
 ) -> Camera:
-    """Return the farthest view with sufficient cover and nothing close to the camera; `offset` is [3]."""
+    """Return the farthest view with sufficient cover and nothing close to the camera.
+
+    If there is none, return the view with the largest cover.
+
+    Args:
+        frame, camera_at, cloud: as in `_around_object`.
+        angles: azimuths and elevations to try, degrees, at least one.
+        offset: [3], from the centre to the look-at point, extents.
+    """
     needed = MIN_COVER + _COVER_MARGIN
     best, best_rank = camera_at(*angles[0], OBJECT_DISTANCES[0], offset=offset), (False, -1.0)
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
-        if highest * (highest_at / distance) ** 2 < 0.8 * needed:
+        if highest * (highest_at / distance) ** 2 < _HOPELESS * needed:
             continue  # the cover at the last distance implies that this distance is not sufficient either
         covers = []
         for angle in angles:
@@ -143,7 +161,15 @@ def _object_view(
 
 
 def _in_surroundings(frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, count: int, begin: float) -> list[Camera]:
-    """Choose views with fine detail that are farthest from each other."""
+    """Choose views with fine detail that are farthest from each other.
+
+    If too few have fine detail, the views with the most are used; if `count` exceeds all positions, views repeat.
+
+    Args:
+        frame, camera_at, cloud: as in `_around_object`.
+        count: number of cameras.
+        begin: first azimuth, degrees.
+    """
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
     cameras = [camera_at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
@@ -157,8 +183,8 @@ def _in_surroundings(frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, coun
         pool = np.argsort(-details, kind="stable")[: max(count, len(pool))]
     positions = np.stack([camera.position for camera in cameras])
     chosen = farthest_points(positions[pool], int(np.argmax(details[pool])), min(count, len(pool)))
-    picked = [cameras[i] for i in pool[chosen]]
-    return [picked[i % len(picked)] for i in range(count)]
+    views = [cameras[i] for i in pool[chosen]]
+    return [views[i % len(views)] for i in range(count)]
 
 
 def farthest_points(points: F64, first: int, count: int) -> list[int]:

@@ -44,18 +44,20 @@ def warm_up(
     Returns:
         Duration in seconds.
     """
-    started, compiles = time.perf_counter(), False
+    started = time.perf_counter()
+    has_compiled = False
 
-    def say() -> None:
-        nonlocal compiles
-        compiles = True
+    def announce_compilation() -> None:
+        """Note that something has to be compiled, and announce it."""
+        nonlocal has_compiled
+        has_compiled = True
         if announce is not None:
             often = "" if cache_failure() else " for this machine, once"
             announce(f"compiling a part of the renderer{often}: this takes up to a minute")
 
-    with on_compiling(say):
+    with on_compiling(announce_compilation):
         viewmat = np.eye(4)
-        viewmat[2, 3] = 5.0
+        viewmat[2, 3] = 5.0  # scene units; the splat is in view
         camera = Camera(
             np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _IMAGE_SIZE, _IMAGE_SIZE
         )
@@ -72,7 +74,7 @@ def warm_up(
         for call in kernel_calls:
             call()
     seconds = time.perf_counter() - started
-    if announce is not None and compiles:
+    if announce is not None and has_compiled:
         why = cache_failure()
         kept = f", for this run alone ({why}); NUMBA_CACHE_DIR names another folder" if why else ""
         announce(f"the renderer is compiled, in {seconds:.0f} s{kept}")
@@ -80,6 +82,7 @@ def warm_up(
 
 
 def _one_splat(dtype: Any) -> UncheckedSplats:
+    """Return an opaque splat of SH degree 0 at the origin."""
     quat, shN = np.array([[1.0, 0.0, 0.0, 0.0]], dtype), np.zeros((1, 0, 3), dtype)
     zeros = np.zeros((1, 3), dtype)
     return UncheckedSplats(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)

@@ -45,7 +45,7 @@ def measure_importance(
             model, cameras, background=background, metric=True, magnitudes=False, context=context
         )
     else:
-        rasteriser = _rasteriser(model)
+        rasteriser = _make_rasteriser(model)
         from csplat_trainer.gsplat_derivatives import estimate_sensitivity
 
         sensitivity = estimate_sensitivity(rasteriser, model, cameras, background, progress=context.progress)
@@ -65,13 +65,14 @@ def measure_pruning(
     """Measure the pruning error of each splat; arguments and errors as for `measure_importance`."""
     if device == "cpu":
         return measure_pruning_error(model, cameras, background=background, context=context)
-    rasteriser = _rasteriser(model)
+    rasteriser = _make_rasteriser(model)
     from csplat_trainer.gsplat_derivatives import estimate_pruning, splats_of
 
     return estimate_pruning(rasteriser, splats_of(rasteriser, model), cameras, background)
 
 
-def _rasteriser(model: SplatModel) -> GsplatRasteriser:
+def _make_rasteriser(model: SplatModel) -> GsplatRasteriser:
+    """Return a rasteriser on the GPU; raise an `InputError` if torch, gsplat or the GPU is absent."""
     try:
         from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
     except ImportError:

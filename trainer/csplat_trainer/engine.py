@@ -87,10 +87,11 @@ class CpuEngine:
         self._options = options
         self._perceptual = perceptual
         self._context = replace(context, progress=null_progress)
-        self._samples = options.strategy in ("mcmc", "fixed")
+        self._samples = options.strategy in ("mcmc", "fixed")  # Markov chain: noise and regularisers
         self._rasteriser = Rasteriser("standard", np.float32, context=self._context)
         self._losses = SizedLosses(options.loss)
-        self._alphas = self._logit_gradient = np.empty(0, np.float32)
+        self._alphas = np.empty(0, np.float32)
+        self._logit_gradient = np.empty(0, np.float32)
         self._normals = np.empty((0, 3), np.float32)
 
     def step(
@@ -127,7 +128,7 @@ class CpuEngine:
             slope = gain.backward(rgb, slope)
         gradients = self._rasteriser.backward(slope)
         values, count = self.parameters.values, max(1, len(self.parameters))
-        _chain(
+        _propagate_to_logits(
             self._alphas,
             gradients.opacities,
             values["scales"],
@@ -164,6 +165,7 @@ class CpuEngine:
         return measure_pruning_error(model, cameras, background=background, context=self._context)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
+        """Render the current state, [H, W, 3], for `backward`; sets the opacities, which `step` uses afterwards."""
         v = self.parameters.values
         if len(self._alphas) != len(v["logits"]):
             self._alphas, self._logit_gradient = np.empty_like(v["logits"]), np.empty_like(v["logits"])
@@ -191,7 +193,7 @@ def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
 
 
 @parallel_kernel(relaxed=True)
-def _chain(
+def _propagate_to_logits(
     lane: int,
     lanes: int,
     alphas: F32,

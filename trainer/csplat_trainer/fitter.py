@@ -88,7 +88,8 @@ class Fitter:
         self.log: dict[str, Any] = {"losses": [], "seconds": 0.0}
         self._window: list[LossValue] = []
         self._pending: list[PendingLoss] = []
-        self._begin, self._first, self._spent = time.perf_counter(), 0, 0.0  # the last two: before a resume
+        self._begin = time.perf_counter()
+        self._steps_before, self._seconds_before = 0, 0.0  # of the run that a checkpoint continues
 
     def resume(self, checkpoint: FitCheckpoint) -> None:
         """Continue from a checkpoint.
@@ -97,13 +98,13 @@ class Fitter:
             InputError: it has gains of another number of images.
         """
         view_count = len(self.gains.values)
-        self.iteration = self._first = checkpoint.iteration
+        self.iteration = self._steps_before = checkpoint.iteration
         self.has_ended = checkpoint.has_ended
         self.rng.bit_generator.state = checkpoint.rng_state
         self.queue = [view for view in checkpoint.queue if view < view_count]
         self.gains = ImageGains(view_count, checkpoint.gains)
         self.log |= checkpoint.log
-        self._spent = float(self.log["seconds"])
+        self._seconds_before = float(self.log["seconds"])
 
     def save(
         self,
@@ -146,7 +147,11 @@ class Fitter:
             self._read_losses()
 
     def _read_losses(self) -> None:
-        """Read the losses of the last steps, and raise an `InputError` if a loss is not finite."""
+        """Add the losses of the pending steps to the log and the window of `report`.
+
+        Raises:
+            InputError: a loss is not finite.
+        """
         first = self.iteration - len(self._pending) + 1
         for step, pending in enumerate(self._pending, first):
             value = pending.read()
@@ -175,9 +180,8 @@ class Fitter:
         """Return the progress since the last report; arguments as in `FitStep`, `None`: estimate the time left."""
         self._read_losses()
         window, self._window = self._window, []
-        loss, mse = (
-            sum(values) / len(window) for values in zip(*((value.loss, value.mse) for value in window), strict=True)
-        )
+        loss = sum(value.loss for value in window) / len(window)
+        mse = sum(value.mse for value in window) / len(window)
         return FitStep(
             self.iteration, self.iterations, loss, psnr_of_mse(mse), splat_count, sh_degree, self.seconds,
             self.seconds_left if seconds_left is None else seconds_left, size_bytes,
@@ -186,10 +190,10 @@ class Fitter:
     @property
     def seconds(self) -> float:
         """Time since the start of the run, without interruptions."""
-        return self._spent + time.perf_counter() - self._begin
+        return self._seconds_before + time.perf_counter() - self._begin
 
     @property
     def seconds_left(self) -> float:
         """Estimated time of the remaining steps."""
-        per_step = (self.seconds - self._spent) / (self.iteration - self._first)
+        per_step = (self.seconds - self._seconds_before) / (self.iteration - self._steps_before)
         return per_step * (self.iterations - self.iteration)

@@ -32,8 +32,9 @@ from csplat_trainer.sensitivity import Sensitivity
 
 _DRAWS = 2  # random images per view
 _LARGEST_ALPHA = 0.998  # gsplat stops at 0.999
-_SEED = 0
-_TRIANGLE = torch.triu_indices(6, 6)
+_SEED = 0  # of the random images
+_SHORTEST = 1e-12  # least length to divide by
+_TRIANGLE = torch.triu_indices(6, 6)  # of a matrix over `_ENTRIES`
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, yz of a covariance
 
 
@@ -48,7 +49,7 @@ def estimate_pruning(
         cameras: the views.
         background: [3].
     """
-    derivatives = _Derivatives(rasteriser, splats, background, matrices=False)
+    derivatives = _EstimatedSquares(rasteriser, splats, background, matrices=False)
     for camera in cameras:
         derivatives.add(camera)
     error = derivatives.opacity * splats.opacities.detach().double().square()
@@ -73,7 +74,7 @@ def estimate_sensitivity(
         background: [3].
         progress: progress callback.
     """
-    derivatives = _Derivatives(rasteriser, splats_of(rasteriser, model), background, matrices=True)
+    derivatives = _EstimatedSquares(rasteriser, splats_of(rasteriser, model), background, matrices=True)
     for number, camera in enumerate(cameras):
         derivatives.add(camera)
         if progress is not None:
@@ -105,14 +106,16 @@ def splats_of(rasteriser: GsplatRasteriser, model: SplatModel) -> SplatTensors:
     return SplatTensors.of(values, rasteriser.upload(model.opacities))
 
 
-class _Derivatives:
-    """Sums of estimated squares over views, on the device.
+class _EstimatedSquares:
+    """Sums of estimated squares of derivatives over views, on the device.
 
     Attributes:
-        opacity, colour, means: [N], squared derivatives by alpha, a channel of the colour, and the centre.
+        opacity: [N], squared derivative by alpha.
+        views: [N], number of views that show the splat.
+        colour, means: [N], squared derivatives by a channel of the colour and by the centre. These and the following
+            have no rows without `matrices`.
         shape: [N, 21], Gauss–Newton matrices of the covariance over its trace; see `Sensitivity.shape_metric`.
         basis: [N, B (B + 1) / 2], Gauss–Newton matrices of the SH coefficients of a channel.
-        views: [N], number of views that show the splat. The last four are not computed without `matrices`.
     """
 
     def __init__(self, rasteriser: GsplatRasteriser, splats: SplatTensors, background: F32, *, matrices: bool) -> None:
@@ -154,14 +157,21 @@ class _Derivatives:
             means, covariances, opacities, slopes = (
                 torch.nan_to_num(gradient, 0.0, 0.0, 0.0) for gradient in gradients
             )
-            seen |= self._add(means, covariances, opacities, slopes, basis)
+            seen |= self._add_products(means, covariances, opacities, slopes, basis)
         self.views += seen
 
     @torch.no_grad()
-    def _add(self, means: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, basis: Tensor) -> Tensor:
-        """Add the products of derivatives, and return which splats are drawn, [N].
+    def _add_products(
+        self, means: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, basis: Tensor
+    ) -> Tensor:
+        """Add the products of the derivatives of one random image, a share of 1 / `_DRAWS` of the view's estimate.
 
-        Means and colours are [N, 3], covariances [N, 3, 3], opacities [N], the basis [N, K].
+        Args:
+            means, covariances, opacities, colours: derivatives, [N, 3], [N, 3, 3], [N], [N, 3].
+            basis: [N, B], the SH basis in the directions of the splats.
+
+        Returns:
+            [N] bool, True for splats that the image shows.
         """
         self.opacity += opacities.square() / _DRAWS
         squares = colours.square().mean(dim=1) / _DRAWS  # each channel has its own signs
@@ -170,6 +180,7 @@ class _Derivatives:
             self.means += means.square().sum(dim=1) / _DRAWS
             trace = self._covariances.diagonal(dim1=1, dim2=2).sum(dim=1)
             both = covariances + covariances.mT  # gsplat gives the derivative by either half alone
+            # Coordinates in which the Frobenius norm is Euclidean: entries off the diagonal count √2 times.
             slopes = torch.stack(
                 [0.5 * both[:, i, j] if i == j else both[:, i, j] / 2**0.5 for i, j in _ENTRIES], dim=1
             )
@@ -181,15 +192,15 @@ class _Derivatives:
     def _basis_functions(self, camera: Camera) -> Tensor:
         """Return the SH basis in the direction of each splat, [N, B]."""
         offsets = self._splats.means.detach() - self._rasteriser.upload(camera.position.astype(np.float32))
-        x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
+        x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp(min=_SHORTEST)).unbind(dim=1)
         basis = offsets.new_empty(((self._degree + 1) ** 2, len(offsets)))
         sh_basis(self._degree, x, y, z, basis)
         return basis.T.contiguous()
 
 
 def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """Return the covariances of splats, [N, 3, 3]."""
-    axes = rotations(quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-12)) * scales[:, None]
+    """Return the covariances of splats, [N, 3, 3], from quats [N, 4] and standard deviations [N, 3]."""
+    axes = rotations(quats / quats.norm(dim=1, keepdim=True).clamp(min=_SHORTEST)) * scales[:, None]
     return axes @ axes.mT
 
 

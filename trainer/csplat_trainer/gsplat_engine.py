@@ -47,7 +47,7 @@ class GsplatEngine:
     ) -> None:
         self._rasteriser = GsplatRasteriser(antialiased=options.antialiased, rasterization=rasterization, device=device)
         self._options = options
-        self._samples = options.strategy in ("mcmc", "fixed")
+        self._samples = options.strategy in ("mcmc", "fixed")  # Markov chain: noise and regularisers
         self.parameters = DeviceParameters(parameters, self._rasteriser.device)
         self.screen: ScreenGradients | None = None
         if options.strategy == "gradient":
@@ -106,7 +106,7 @@ class GsplatEngine:
 
     @torch.no_grad()
     def _add_noise(self, strength: float, seed: int) -> None:
-        """Move splats at random inside their own shapes; see `strategies.add_noise`."""
+        """Move splats at random inside their own shapes, as `strategies.add_noise`; means that would overflow stay."""
         v = self.parameters.tensors
         gate = strength * torch.sigmoid(GATE_SLOPE * (1.0 - torch.sigmoid(v["logits"]) - GATE_CENTRE))
         rotation, sizes = rotations(v["quats"]), v["scales"].exp()

@@ -22,7 +22,8 @@ from csplat_render.camera import Camera
 from csplat_trainer.parameters import GROUPS, Parameters
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
-_LOGIT_LIMIT = 14.0
+_LOGIT_LIMIT = 14.0  # as in `parameters`
+_SHORTEST = 1e-12  # least length to divide by
 
 Tensors = Mapping[str, Tensor]
 
@@ -49,6 +50,7 @@ def gsplat_rasterization() -> Callable[..., Any]:
 
 
 def _last_line(error: Exception) -> str:
+    """Return the last line of an error's message that is not blank; its type if there is none."""
     lines = [line for line in re.split(r"\s*\n\s*", str(error)) if line]
     return lines[-1] if lines else type(error).__name__
 
@@ -158,6 +160,16 @@ class GsplatRasteriser:
         return torch.from_numpy(np.array(array)).to(self.device)
 
     def _draw(self, camera: Camera, background: Tensor, **splats: Any) -> tuple[Tensor, dict[str, Any]]:
+        """Call gsplat for one view; the matrices of a camera stay on the device.
+
+        Args:
+            camera: the camera.
+            background: [3].
+            splats: the arguments of `rasterization` that differ between the kinds of splats.
+
+        Returns:
+            [H, W, 3], and what gsplat returns besides.
+        """
         stored = self._cameras.get(id(camera))
         if stored is None:
             stored = (
@@ -274,12 +286,14 @@ class DeviceParameters(Parameters):
         self.step += 1
         quats = self.tensors["quats"]
         length = quats.norm(dim=1, keepdim=True)
-        quats.div_(length.clamp_(min=1e-12))
+        quats.div_(length.clamp_(min=_SHORTEST))
         self.tensors["logits"].clamp_(-_LOGIT_LIMIT, _LOGIT_LIMIT)
 
     @property
     def _moments(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Adam's running means of gradients and of their squares, on the device."""
         return cast("dict[str, Tensor]", self.first), cast("dict[str, Tensor]", self.second)
 
     def _upload(self, array: NDArray[Any]) -> Tensor:
+        """Copy an array to the device; on a CPU, the tensor may share its memory."""
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)

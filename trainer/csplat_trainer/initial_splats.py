@@ -23,6 +23,13 @@ _BATCH = 20_000  # points drawn at a time
 _BATCHES = 400  # largest number of batches
 _MASK = 0.02  # least alpha of pixels of the object
 _MISSES = 0.02  # fraction of the images that may miss a point of the hull, due to rounding to pixels
+_ROUNDING = 1e-9  # tolerance of that fraction in float64
+_UNSEEN_COLOUR = 0.5  # grey, of points without a pixel of the object
+_SPACING_MIN = 1e-4  # least size of a splat, as a fraction of the median size
+_TINY = 1e-6  # scene units; least size of a box, and least distance of a guess of the focus
+_EXTENT_FACTOR = 1.1  # INRIA's margin around the cameras
+_EXTENT_MIN = 1e-3  # scene units; least extent if all cameras are in one place
+_GUESS_WEIGHT = 1e-3  # weight of the guess of the focus, relative to a camera's line of sight
 _NEIGHBOURS = 3  # number of neighbours whose distance determines a splat's size
 _BOX_FRACTION = 0.9  # fraction of the median camera's field of view at the distance of the focus
 _PHOTO_BOX = 1.5  # half the box as a multiple of that distance, for images without alpha, which show surroundings
@@ -56,19 +63,19 @@ def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
     spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
     # Least squares over the distances from the lines; the small term makes it well-posed for parallel lines.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weight = 1e-3 * len(cameras)
-    guess = (positions + axes * max(float(spread), 1e-6)).mean(axis=0)
-    left = across.sum(axis=0) + weight * np.eye(3)
-    focus = np.linalg.solve(left, np.einsum("nij,nj->i", across, positions) + weight * guess)
+    weight = _GUESS_WEIGHT * len(cameras)
+    guess = (positions + axes * max(float(spread), _TINY)).mean(axis=0)
+    normal_matrix = across.sum(axis=0) + weight * np.eye(3)
+    focus = np.linalg.solve(normal_matrix, np.einsum("nij,nj->i", across, positions) + weight * guess)
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
     half_view = float(np.median([0.5 * min(c.W / c.K[0, 0], c.H / c.K[1, 1]) for c in cameras]))
     half = distance * half_view * _BOX_FRACTION
     if not any(image.has_alpha for image in images):
         half = distance * _PHOTO_BOX
-    extent = 1.1 * float(spread)
+    extent = _EXTENT_FACTOR * float(spread)
     if extent <= 0.0:  # all cameras in one place
-        extent = max(distance, 1e-3)
-    return SceneExtent(extent, focus, max(half, 1e-6))
+        extent = max(distance, _EXTENT_MIN)
+    return SceneExtent(extent, focus, max(half, _TINY))
 
 
 def place_splats(
@@ -119,11 +126,17 @@ def place_splats(
     else:
         masked = have_masks and init in ("hull", "auto")
         means, colour = _in_box(images, scene, count, rng, masked=masked)
-    return _splats(means, colour, sh_degree, scene, rng)
+    return _initial_parameters(means, colour, sh_degree, scene, rng)
 
 
 def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: Generator) -> tuple[F64, F64]:
-    """Choose some of the points [M, 3], and their colours. If there are fewer than `count`, repeat some with noise."""
+    """Choose `count` of the points [M, 3], and their colours [M, 3]; if there are fewer, repeat some with noise.
+
+    The noise has the distance to the neighbours as its standard deviation along each axis.
+
+    Returns:
+        Means and colours, [count, 3] each.
+    """
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
@@ -138,7 +151,14 @@ def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: G
 def _in_box(
     images: Sequence[PosedImage], scene: SceneExtent, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
-    """Draw points that cameras see, inside the hull if `masked`, with the mean of their pixels, [count, 3] each."""
+    """Draw points in the box that cameras see, inside the visual hull if `masked`, with the mean of their pixels.
+
+    Points are repeated if fewer than `count` are found in `_BATCHES` batches; without any, all of the box is used, in
+    grey.
+
+    Returns:
+        Means and colours, [count, 3] each.
+    """
     kept: list[F64] = []
     colours: list[F64] = []
     total = 0
@@ -147,15 +167,15 @@ def _in_box(
         seen, hits, colour = _sample_images(images, points)
         keep = seen > 0
         if masked:
-            keep &= hits >= (1.0 - _MISSES) * seen - 1e-9
-            keep &= 2 * seen >= len(images)
+            keep &= hits >= (1.0 - _MISSES) * seen - _ROUNDING
+            keep &= 2 * seen >= len(images)  # the object is in view of most cameras
         kept.append(points[keep])
         colours.append(colour[keep])
         total += int(keep.sum())
         if total >= count:
             break
     if total == 0:  # inconsistent masks, or cameras without a common subject
-        return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), 0.5)
+        return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), _UNSEEN_COLOUR)
     means, colour = np.concatenate(kept), np.concatenate(colours)
     chosen = np.concatenate([np.arange(total), rng.integers(0, total, max(0, count - total))])[:count]
     return means[chosen], colour[chosen]
@@ -175,7 +195,7 @@ def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[n
         on = pixels[:, 3] >= _MASK
         hits[inside[on]] += 1
         colour[inside[on]] += pixels[on, :3]
-    return seen, hits, np.where(hits[:, None] > 0, colour / np.maximum(hits, 1)[:, None], 0.5)
+    return seen, hits, np.where(hits[:, None] > 0, colour / np.maximum(hits, 1)[:, None], _UNSEEN_COLOUR)
 
 
 def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
@@ -192,7 +212,11 @@ def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
     return inside, image.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
 
 
-def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Generator) -> ParameterArrays:
+def _initial_parameters(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Generator) -> ParameterArrays:
+    """Return balls at means [N, 3] with colours [N, 3] in 0..1, as large as the distance to their neighbours.
+
+    Rotations are random, opacities `_OPACITY`, SH bands above 0 zero.
+    """
     count = len(means)
     spacing = np.log(_neighbour_distances(means, scene)).astype(np.float32)
     quats = rng.standard_normal((count, 4))
@@ -208,7 +232,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Ge
 
 
 def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
-    """Return the root mean square distance of points [M, 3] to the three nearest other points, [M], never 0.
+    """Return the root mean square distance of points [M, 3] to the `_NEIGHBOURS` nearest other points, [M], never 0.
 
     If most points coincide with other points, return the distance between points that fill the box evenly.
     """
@@ -219,4 +243,4 @@ def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
     distances = KDTree(points).query(points, k + 1)[0][:, 1:]
     spacing: F64 = np.sqrt(np.square(distances).mean(axis=1))
     typical = float(np.median(spacing))
-    return np.maximum(spacing, 1e-4 * typical) if typical > 0.0 else np.where(spacing > 0.0, spacing, evenly)
+    return np.maximum(spacing, _SPACING_MIN * typical) if typical > 0.0 else np.where(spacing > 0.0, spacing, evenly)

@@ -197,7 +197,10 @@ def _ssim_partials_and_sums(lane: int, lanes: int, x: F32, y: F32, across: F32, 
 
 @parallel_kernel(relaxed=True)
 def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
-    """Blur the three derivatives, [3, H, 3 W] with a margin, along each row; vectorises over the values of a row."""
+    """Blur `partial` of `_ssim_partials_and_sums` along each row; vectorises over the values of a row.
+
+    `across` [3, H + 2 RADIUS, 3 W] is written but for the margins above and below.
+    """
     for r in range(lane, partial.shape[1], lanes):
         for f in range(3):
             blur_across(partial[f, r], _TAPS, across[f, r + RADIUS])
@@ -207,7 +210,15 @@ def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
 def _combine(
     lane: int, lanes: int, x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32
 ) -> None:
-    """Blur the derivatives across the rows of [H, 3 W] and add the gradient of L1; vectorises over a row."""
+    """Blur the derivatives across the rows, and combine the gradients of L1 and SSIM; vectorises over a row.
+
+    Args:
+        x, y: [H, 3 W].
+        across: [3, H + 2 RADIUS, 3 W], from `_blur_partials`.
+        l1_step: weight of L1 per value.
+        ssim_step: weight of SSIM per value, negative.
+        gradient: [H, 3 W], written.
+    """
     height, width = x.shape
     blurred = np.empty((3, width), np.float32)
     for r in range(lane, height, lanes):
@@ -222,7 +233,14 @@ def _combine(
 
 @parallel_kernel(relaxed=True)
 def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
-    """Compute L1 and squared error of each row of [H, 3 W]; vectorises over the values of a row."""
+    """Compute the gradient of L1, and the sums of each row; vectorises over the values of a row.
+
+    Args:
+        x, y: [H, 3 W].
+        l1_step: weight of L1 per value.
+        gradient: [H, 3 W], written.
+        sums: [H, 3], written; |x − y|, NaN in place of SSIM, and (x − y)².
+    """
     height, width = x.shape
     for r in range(lane, height, lanes):
         l1_sum, square_sum = np.float32(0.0), np.float32(0.0)
@@ -262,9 +280,9 @@ def photometric_loss_twin(
 # pyright: reportMissingImports=false
 
 
-_STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
-_POOLED = (1, 2)  # layers after a 3×3 pooling of stride 2
-_LPIPS_EPSILON = 1e-10
+_STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)  # of AlexNet's five convolutions
+_POOLED = (1, 2)  # indices of layers after a 3×3 pooling of stride 2
+_LPIPS_EPSILON = 1e-10  # added to the squared length, so that the gradient of a zero vector is finite
 
 
 class PerceptualLoss:
@@ -302,17 +320,20 @@ class PerceptualLoss:
         return slope
 
     def _tensor(self, image: F32) -> Any:
+        """Copy an image [H, W, 3] to a tensor [1, 3, H, W]; raise an `InputError` if a side is below `MIN_SIZE`."""
         if min(image.shape[:2]) < MIN_SIZE:
             raise InputError(f"an image has {image.shape[:2]} pixels, expected at least {MIN_SIZE} per side for LPIPS")
         return _import_torch().from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].clone()
 
     def _distance(self, x: Any, y: Any) -> Any:
+        """Return LPIPS of two tensors [1, 3, H, W], a tensor [] with a gradient."""
         total: Any = 0.0
         for first, second, head in zip(self._features(x), self._features(y), self._heads, strict=True):
             total = total + (head * (_unit(first) - _unit(second)).square()).sum(dim=1).mean()
         return total
 
     def _features(self, image: Any) -> list[Any]:
+        """Return the activations of the five layers, [1, C, h, w] each, of an image [1, 3, H, W] in 0..1."""
         functional = _import_torch().nn.functional
         layers = []
         x = (2.0 * image - 1.0 - self._shift) / self._scale
@@ -325,11 +346,12 @@ class PerceptualLoss:
 
 
 def _unit(x: Any) -> Any:
-    """Scale feature vectors to unit length."""
+    """Scale feature vectors [1, C, h, w] to unit length over the channels; zero vectors stay zero."""
     return x / (x.square().sum(dim=1, keepdim=True) + _LPIPS_EPSILON).sqrt()
 
 
 def _import_torch() -> Any:
+    """Return the module torch, imported on use; raise an `InputError` if it is not installed."""
     try:
         import torch
     except ImportError:

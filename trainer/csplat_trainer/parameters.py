@@ -22,6 +22,9 @@ ParameterArrays = dict[str, F32]
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
 _BETA1, _EPSILON = 0.9, 1e-15
+_TINY = 1e-30  # moments up to this become 0
+_SHORTEST = 1e-12  # least length of a quaternion that is normalised; shorter ones become the identity
+_ALPHA_MARGIN = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
 _LOGIT_LIMIT = 14.0  # beyond, alpha has few digits in float32
 _BLOCK = 1 << 13  # values processed by a thread at a time
 
@@ -133,8 +136,8 @@ def sigmoid(logits: F32) -> F32:
 
 
 def logits_of(opacities: F32) -> F32:
-    """Return the logits of opacities, which are limited to 1e-6 from 0 and 1."""
-    alpha = np.clip(opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
+    """Return the logits of opacities, which are limited to `_ALPHA_MARGIN` from 0 and 1."""
+    alpha = np.clip(opacities.astype(np.float64), _ALPHA_MARGIN, 1.0 - _ALPHA_MARGIN)
     logits: F32 = np.log(alpha / (1.0 - alpha)).astype(np.float32)
     return logits
 
@@ -174,16 +177,22 @@ def _adam(
     first: F32,
     second: F32,
     rate: np.float32,
-    over: np.float32,
+    over_root: np.float32,
     b2: np.float32,
     a2: np.float32,
 ) -> None:
-    """Make a step of Adam on arrays [n]; vectorises over their values.
+    """Make a step of Adam; vectorises over the values.
 
-    `a2` is 1 - `b2`; a compiler that knew this might use a difference of squares, which is NaN for infinite ones.
+    Args:
+        value, first, second: [n], values and moments; changed in place.
+        gradient: [n].
+        rate: learning rate over 1 - β1^step.
+        over_root: 1 / √(1 - β2^step).
+        b2: β2.
+        a2: 1 - β2; a compiler that knew this might use a difference of squares, which is NaN for infinite ones.
     """
     b1, a1 = np.float32(_BETA1), np.float32(1.0 - _BETA1)
-    epsilon, tiny = np.float32(_EPSILON), np.float32(1e-30)
+    epsilon, tiny = np.float32(_EPSILON), np.float32(_TINY)
     blocks = (value.shape[0] + _BLOCK - 1) // _BLOCK
     for block in range(lane, blocks, lanes):
         begin = block * _BLOCK
@@ -199,19 +208,19 @@ def _adam(
             square = square if square > tiny else np.float32(0.0)
             m[i] = mean
             v[i] = square
-            p[i] -= rate * mean / (np.sqrt(square) * over + epsilon)
+            p[i] -= rate * mean / (np.sqrt(square) * over_root + epsilon)
 
 
 @relaxed_kernel
 def _constrain(quats: F32, logits: F32) -> None:
-    """Normalise quats [N, 4] and clip logits [N], splat by splat."""
+    """Normalise quats [N, 4], and clip logits [N] to ± `_LOGIT_LIMIT`, in place."""
     limit = np.float32(_LOGIT_LIMIT)
     for i in range(len(logits)):
         logits[i] = min(max(logits[i], -limit), limit)
     for i in range(quats.shape[0]):
         w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         length = np.sqrt(w * w + x * x + y * y + z * z)
-        if length > np.float32(1e-12):
+        if length > np.float32(_SHORTEST):
             over = np.float32(1.0) / length
             quats[i, 0] = w * over
             quats[i, 1] = x * over

@@ -113,6 +113,7 @@ class PosedImage:
         return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
 
     def _check(self, pixels: U8) -> None:
+        """Raise an `InputError` unless pixels are uint8, RGB or RGBA, and of the camera's size."""
         shape = (self.camera.H, self.camera.W)
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
             raise InputError(f"an image is {pixels.dtype} {list(pixels.shape)}, expected uint8 [H, W, 3 or 4]")
@@ -155,15 +156,15 @@ def halve(image: PosedImage) -> PosedImage:
 
 @parallel_kernel()
 def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> None:
-    """Blend each row of [H, W, 3 or 4] with the background [3]; a thread takes a run of rows."""
+    """Blend pixels [H, W, 3 or 4] with the background [3] into `out` [H, W, 3], 0..1; parallel over rows."""
     over = np.float32(1.0 / 255.0)
     for r in range(lane, pixels.shape[0], lanes):
         for c in range(pixels.shape[1]):
             if pixels.shape[2] == 4:
                 alpha = np.float32(pixels[r, c, 3]) * over
-                rest = np.float32(1.0) - alpha
+                share = np.float32(1.0) - alpha  # of the background
                 for k in range(3):
-                    out[r, c, k] = alpha * (np.float32(pixels[r, c, k]) * over) + rest * background[k]
+                    out[r, c, k] = alpha * (np.float32(pixels[r, c, k]) * over) + share * background[k]
             else:
                 for k in range(3):
                     out[r, c, k] = np.float32(pixels[r, c, k]) * over
@@ -216,10 +217,12 @@ def evaluate(
 
 
 def _reference_image(image: PosedImage, background: F32) -> ReferenceImage:
+    """Return an image in front of a background [3], with the pixels that its alpha, if any, marks as covered."""
     shown = compose(image, background, np.empty((image.camera.H, image.camera.W, 3), np.float32))
     covered = image.pixels[..., 3] >= COVERED_ALPHA * 255.0 if image.has_alpha else None
     return ReferenceImage(shown, covered, mask=image.mask)
 
 
 def _pixel_count(image: PosedImage) -> int:
+    """Return the number of pixels that count."""
     return image.camera.W * image.camera.H if image.mask is None else int(image.mask.sum())

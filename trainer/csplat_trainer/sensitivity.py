@@ -164,7 +164,11 @@ def measure_sensitivity(
 
 
 class _Derivatives(Rasteriser):
-    """A rasteriser that sums the derivatives of views. Owns the sums."""
+    """A rasteriser that sums the derivatives of views, and owns the sums.
+
+    Args:
+        model, metric, magnitudes, dtype, context: as for `measure_sensitivity`. Sums not requested have no rows.
+    """
 
     def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, context: Context) -> None:
         super().__init__("standard", dtype, gradients=True, context=context)
@@ -172,11 +176,12 @@ class _Derivatives(Rasteriser):
         self._model = model
         rows = n if magnitudes else 0
         self._colour = np.zeros((rows, count, 3), np.float32)
-        self._net, self._sizes = np.zeros((rows, 7)), np.zeros((rows, 7))
-        self._squares, self._shape_matrices = np.zeros((n, 3)), np.zeros((n, 21))
+        self._net, self._sizes = np.zeros((rows, 7)), np.zeros((rows, 7))  # alpha, six entries of the covariance
+        self._squares = np.zeros((n, 3))  # colour, alpha, centre
+        self._shape_matrices = np.zeros((n, 21))  # upper triangles over the six entries
         self._metric = np.zeros((n if metric else 0, count * (count + 1) // 2), np.float32)
         self._views = np.zeros(n, np.int64)
-        self._wanted, self._magnitudes = metric, magnitudes
+        self._keeps_metric, self._keeps_magnitudes = metric, magnitudes
         self._view_count = self._pixel_count = 0
 
     def add(self, camera: Camera, background: ArrayLike) -> None:
@@ -212,7 +217,7 @@ class _Derivatives(Rasteriser):
         shape_matrices, squares, net, sizes = (
             _mean_over(sums, pixels) for sums in (self._shape_matrices, self._squares, self._net, self._sizes)
         )
-        kept = self._magnitudes
+        kept = self._keeps_magnitudes
         return Sensitivity(
             colour=self._colour.max(axis=(1, 2), initial=0.0).astype(np.float64) / pixels if kept else None,
             opacity=sizes[:, 0] if kept else None,
@@ -224,7 +229,7 @@ class _Derivatives(Rasteriser):
             shape_squares=shape_matrices[:, _DIAGONAL].sum(axis=1),
             means_squares=squares[:, 2],
             shape_metric=shape_matrices,
-            metric=self._metric if self._wanted else None,
+            metric=self._metric if self._keeps_metric else None,
             views=self._views,
             view_count=self._view_count,
             pixel_count=self._pixel_count,
@@ -379,7 +384,14 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
 def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
     """Sum over the pixels of a tile for one splat: the equations at the top of this module, with h = (u, v, w).
 
-    `form` contains the splat's row of `covariance_forms`, then h at the middle of the tile.
+    The first pass over the pixels computes all sums but those of t tᵀ, the second pass these.
+
+    Args:
+        body: planes of the tile, from the first pixel of the splat on.
+        count: number of pixels.
+        form: [FORM_SIZE + 3], the splat's row of `covariance_forms`, then h at the middle of the tile.
+        sums: [DERIVATIVE_SUMS], written, in the order of the equations; entries of symmetric matrices xx yy zz xy xz
+            yz, and of t tᵀ the upper triangle, row by row.
     """
     zero = form[0] - form[0]
     ax, ay, bx, by, cx, cy = form[0], form[1], form[2], form[3], form[4], form[5]

@@ -95,6 +95,7 @@ class StoredSensitivity:
         )
 
     def _apply_floor(self, name: str) -> NDArray[np.float32]:
+        """Return a group [N], with `_FLOOR` of its positive median, or 1 without any, for splats that no view saw."""
         weights = self.groups[name]
         positive = weights[weights > 0.0]
         least = np.float32(_FLOOR * float(np.median(positive))) if len(positive) else np.float32(1.0)

@@ -150,10 +150,17 @@ def _step_length(rms: float) -> float:
 
 
 class _Refit:
-    """A refit to training views by a `Fitter`, with steps that become shorter along half a cosine."""
+    """A refit to training views by a `Fitter`, with steps that become shorter along half a cosine.
+
+    Args:
+        views: at least one.
+        steps: number of steps; each pass over the views has a random order of its own.
+        context: progress, and the seed of these orders.
+    """
 
     def __init__(self, views: _TrainingViews, steps: int, context: Context) -> None:
-        self._views, self._context, self._length = views, context, 0.0
+        self._views, self._context = views, context
+        self._length = 0.0  # of the first steps, set by `run`
         self._fitter = Fitter(len(views), steps, context.seed)
         passes = [self._fitter.rng.permutation(len(views)) for _ in range(-(-steps // len(views)))]
         self._fitter.queue = np.concatenate(passes)[:steps][::-1].tolist()  # the last is the next
@@ -166,19 +173,25 @@ class _Refit:
     def step(self, view: int) -> LossValue:
         fitter = self._fitter
         factor = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * fitter.iteration / fitter.iterations))
-        error = self._move(view, {name: self._length * factor * rate for name, rate in _RATES.items()})
+        error = self._make_step(view, {name: self._length * factor * rate for name, rate in _RATES.items()})
         return LossValue(error, math.nan, math.nan, error)
 
     def after_step(self) -> None:
         self._context.progress("adjusting splats", self._fitter.iteration / self._fitter.iterations)
 
-    def _move(self, view: int, rates: dict[str, float]) -> float:
+    def _make_step(self, view: int, rates: dict[str, float]) -> float:
         """Make a step on a view, and return its mean squared error before."""
         raise NotImplementedError
 
 
 class _FloatRefit(_Refit):
-    """A refit of values without quantisation."""
+    """A refit of values without quantisation.
+
+    Args:
+        views, steps, context: as for `_Refit`.
+        model: the scene.
+        moves: fit the centres instead of `shN`.
+    """
 
     def __init__(
         self,
@@ -206,7 +219,7 @@ class _FloatRefit(_Refit):
         shN = start.shN if self._moves else v["shN"]
         return UncheckedSplats(means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], shN)
 
-    def _move(self, view: int, rates: dict[str, float]) -> float:
+    def _make_step(self, view: int, rates: dict[str, float]) -> float:
         splats = self.splats()
         error, gradients = self._views.gradients(splats, view)
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
@@ -245,6 +258,7 @@ class _FloatRefit(_Refit):
 
 
 def _values_to_fit(model: SplatModel) -> dict[str, F32]:
+    """Return the parameters of a model's splats but for the means."""
     values = from_model(model, model.sh_degree)
     del values["means"]
     return values
@@ -259,7 +273,7 @@ class _QuantisedRefit(_Refit):
         self.scene = TunedScene(fixed)
         self.scene.parameters.beta2 = _BETA2
 
-    def _move(self, view: int, rates: dict[str, float]) -> float:
+    def _make_step(self, view: int, rates: dict[str, float]) -> float:
         fitter, (seen, alphas) = self._fitter, self.scene.dequantise()
         error, gradients = self._views.gradients(seen, view)
         if self.lambda_ and (fitter.iteration - 1) % COUNT_EVERY == 0:

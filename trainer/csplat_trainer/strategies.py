@@ -30,6 +30,8 @@ from csplat_trainer.pruning import kept_in_round
 
 _MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
+_SOURCE_MARGIN = 1e-7  # least distance from 0 and 1 of an opacity that is shared, so that factors of scales are finite
+_SHARED_MARGIN = 1e-6  # least distance from 0 and 1 of a shared opacity, so that logits are finite
 GATE_SLOPE, GATE_CENTRE = 100.0, 0.995  # the paper's gate, which limits noise to nearly transparent splats
 MAX_NOISE = 1.0  # standard deviations per step; the paper's noise moves large splats out of small scenes
 _GATE_OFF = 0.1  # opacity above which the gate is below 1e-4
@@ -52,7 +54,7 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
     if len(dead) == 0 or len(alive) == 0:
         return 0
     sources = _draw_by_opacity(alphas, alive, len(dead), rng)
-    _share_among(parameters, sources, alphas, dead_opacity)
+    _share_opacity_among(parameters, sources, alphas, dead_opacity)
     parameters.copy_rows(sources, dead)
     parameters.forget(dead)
     return len(dead)
@@ -77,7 +79,7 @@ def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, r
         return 0
     alphas = parameters.alphas
     sources = _draw_by_opacity(alphas, np.arange(count), added, rng)
-    _share_among(parameters, sources, alphas, dead_opacity)
+    _share_opacity_among(parameters, sources, alphas, dead_opacity)
     parameters.append_copies(sources)
     return added
 
@@ -108,17 +110,26 @@ def _draw_by_opacity(alphas: F32, among: I64, count: int, rng: Generator) -> I64
     return chosen
 
 
-def _share_among(parameters: Parameters, sources: I64, alphas: F32, least: float) -> None:
+def _share_opacity_among(parameters: Parameters, sources: I64, alphas: F32, least: float) -> None:
+    """Give each source the opacity and scales of a splat that shares its place with its copies; copy it afterwards.
+
+    Args:
+        parameters: logits and scales of the sources are changed in place, and their moments are reset.
+        sources: splats to be copied, once for each occurrence.
+        alphas: [N], opacities of all splats.
+        least: least opacity of the result.
+    """
     places, counts = np.unique(sources, return_counts=True)
-    old = np.clip(alphas[places].astype(np.float64), 1e-7, 1.0 - 1e-7)
+    old = np.clip(alphas[places].astype(np.float64), _SOURCE_MARGIN, 1.0 - _SOURCE_MARGIN)
     shared, factor = share_opacity(old, np.minimum(counts + 1, _MAX_SHARE))
-    shared = np.clip(shared, max(least, 1e-6), 1.0 - 1e-6)
+    shared = np.clip(shared, max(least, _SHARED_MARGIN), 1.0 - _SHARED_MARGIN)
     parameters.write("logits", places, np.log(shared / (1.0 - shared)).astype(np.float32))
-    _add(parameters, "scales", places, np.log(factor)[:, None].astype(np.float32))
+    _add_to_rows(parameters, "scales", places, np.log(factor)[:, None].astype(np.float32))
     parameters.forget(places)
 
 
-def _add(parameters: Parameters, name: str, rows: I64, summand: F32 | np.float32) -> None:
+def _add_to_rows(parameters: Parameters, name: str, rows: I64, summand: F32 | np.float32) -> None:
+    """Add to a group's values of some splats, in place; the summand has their shape, or is broadcast to it."""
     parameters.write(name, rows, parameters.read(name, rows) + summand)
 
 
@@ -133,17 +144,20 @@ def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
         normals: [N, 3], standard normal numbers.
     """
     v = parameters.values
-    _noise(v["means"], v["quats"], v["scales"], v["logits"], np.float32(strength), normals)
+    _add_noise(v["means"], v["quats"], v["scales"], v["logits"], np.float32(strength), normals)
 
 
 @parallel_kernel()
-def _noise(
+def _add_noise(
     lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
 ) -> None:
-    """Add the noise to each mean, in proportion to `normals` [N, 3]; parallel over runs of splats."""
-    highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
+    """Add noise to means [N, 3], as `add_noise`; parallel over runs of splats.
+
+    Splats above an opacity of `_GATE_OFF` are skipped, and means that would overflow stay.
+    """
+    logit_max = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
     for i in range(*lane_range(lane, lanes, means.shape[0])):
-        if logits[i] > highest:
+        if logits[i] > logit_max:
             continue
         alpha = 1.0 / (1.0 + math.exp(-logits[i]))
         gate = strength / (1.0 + math.exp(-GATE_SLOPE * (1.0 - alpha - GATE_CENTRE)))
@@ -238,8 +252,8 @@ def densify(
     if len(split):
         offsets = _split_offsets(parameters.read("quats", split), parameters.read("scales", split), rng)
         for rows, offset in zip((split, copies), offsets, strict=True):
-            _add(parameters, "means", rows, offset)
-            _add(parameters, "scales", rows, -np.float32(np.log(_SPLIT_SHRINK)))
+            _add_to_rows(parameters, "means", rows, offset)
+            _add_to_rows(parameters, "scales", rows, -np.float32(np.log(_SPLIT_SHRINK)))
         parameters.forget(split)
     parameters.keep(np.concatenate([np.flatnonzero(alive), np.arange(before, len(parameters))]))
     return len(parameters) - before
@@ -258,7 +272,16 @@ def reset_opacities(parameters: Parameters) -> None:
 
 
 def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
-    """Draw two offsets, [N, 3] each, for each splat from its own shape."""
+    """Draw two offsets for each splat from its own shape.
+
+    Args:
+        quats: [N, 4], of unit length.
+        scales: [N, 3], logarithms.
+        rng: source of the offsets.
+
+    Returns:
+        [N, 3] each.
+    """
     w, x, y, z = quats.astype(np.float64).T
     rotation = np.stack(
         [

@@ -38,18 +38,17 @@ from csplat.scene_metadata import SceneMetadata
 from csplat.spherical_harmonics import SH_C0
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # a zip, or a pickle as written by torch before 1.6
-_NAMED = 5  # names in a message
-_NAME_SHOWN = 80  # maximum number of characters of a name in a message
-_LARGEST_PICKLE = 1 << 22  # bytes; checkpoints have up to 100 kB, and a byte may become an object of 72
-_LEGACY_PICKLES = (
-    5  # at the beginning of a file written by torch before 1.6; the tensors follow (torch/serialization.py)
-)
+_NAMES_SHOWN = 5  # names in a message
+_NAME_LENGTH_MAX = 80  # maximum number of characters of a name in a message
+_PICKLE_SIZE_MAX = 1 << 22  # bytes; checkpoints have up to 100 kB, and a byte may become an object of 72
+# Pickles at the beginning of a file written by torch before 1.6; the tensors follow (torch/serialization.py).
+_LEGACY_PICKLES = 5
 #: Values returned by INRIA's `GaussianModel.capture` after the active SH degree (scene/gaussian_model.py).
 _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
 #: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
-_FILTER = "filter_3D"
+_FILTER = "filter_3D"  # name of Mip-Splatting's tensor of filter sizes
 #: gsplat's names of tensors, by the names in gsplat and splatfacto, in Gaussian Splatting Lightning, and of attributes
 #: in INRIA's `GaussianModel`, which trainers derived from it save as a state.
 _NAMES = {
@@ -72,9 +71,18 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    paths, findings = _rank_files(path)
-    parts = [_read(file, sh_degree) for file in paths]
+def _open_checkpoint(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    """Read a checkpoint, with the parts of other GPUs next to it, as a scene in memory.
+
+    Args:
+        path: the file, or the file of one of several GPUs.
+        sh_degree: `None` refuses bands beyond `MAX_SH_DEGREE`; any number drops them.
+
+    Raises:
+        InputError: a file is no checkpoint of splats, is damaged or missing; or parts have different SH degrees.
+    """
+    paths, findings = _find_rank_files(path)
+    parts = [_read_part(file, sh_degree) for file in paths]
     models = [part.model for part in parts]
     degrees = sorted({model.sh_degree for model in models})
     if len(degrees) > 1:
@@ -108,7 +116,7 @@ class _CheckpointPart(NamedTuple):
     findings: list[Finding]
 
 
-def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
+def _find_rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
     """Return the files of all GPUs of a run of gsplat, given the file of a GPU.
 
     Raises:
@@ -124,7 +132,7 @@ def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
             by_rank[int(match["rank"])] = file
     absent = sorted(set(range(max(by_rank))) - set(by_rank))
     if absent:
-        missing = ", ".join(f"{named['run']}{rank}{named['ending']}" for rank in absent[:_NAMED])
+        missing = ", ".join(f"{named['run']}{rank}{named['ending']}" for rank in absent[:_NAMES_SHOWN])
         raise InputError(
             f"{path.name} has the splats of one of several GPUs, expected the others' files next to it: no {missing}"
         )
@@ -136,7 +144,13 @@ def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
-def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
+def _read_part(path: Path, sh_degree: int | None) -> _CheckpointPart:
+    """Read the splats of one file; `sh_degree` as for `_open_checkpoint`.
+
+    Raises:
+        InputError: the file is no checkpoint of splats, could run code, or is damaged; or torch is not installed.
+        OSError: the file cannot be read.
+    """
     head = read_head(path)
     kind = detect_content(path, head)
     if not head.startswith(_MAGICS):
@@ -148,7 +162,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     except ModuleNotFoundError as error:
         raise InputError(f"{path.name} is a checkpoint of torch: {missing_package(error, extra='train')}") from None
     try:
-        with _plain_numbers(torch), warnings.catch_warnings(action="ignore"):
+        with _admit_plain_numbers(torch), warnings.catch_warnings(action="ignore"):
             # Memory-mapped, since two thirds of a checkpoint of splatfacto are Adam's moments.
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except OSError:
@@ -160,7 +174,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
             reason = "is a truncated or damaged checkpoint of torch: copy it again, or export its splats as PLY"
         raise InputError(f"{path.name} {reason}") from None
     try:
-        return _model_of(content, path.stat().st_size, sh_degree)
+        return _read_content(content, path.stat().st_size, sh_degree)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -172,7 +186,7 @@ def _check_pickles(path: Path) -> None:
         InputError: a part of the zip, or a pickle, exceeds its limit.
         OSError: the file cannot be read.
     """
-    refusal = f"{path.name} has a pickle of more than {_LARGEST_PICKLE:,} bytes, expected tensors next to a small one"
+    refusal = f"{path.name} has a pickle of more than {_PICKLE_SIZE_MAX:,} bytes, expected tensors next to a small one"
     if zipfile.is_zipfile(path):
         try:
             with zipfile.ZipFile(path) as archive:
@@ -180,23 +194,23 @@ def _check_pickles(path: Path) -> None:
         except DAMAGED:
             return  # torch reports the damage
         for info in members:
-            if info.filename.endswith(".pkl") and info.file_size > _LARGEST_PICKLE:
+            if info.filename.endswith(".pkl") and info.file_size > _PICKLE_SIZE_MAX:
                 raise InputError(refusal)
             if reason := member_refusal(info, unpacked_limit(info.compress_size)):
-                raise InputError(f"{path.name}: its part {info.filename[:_NAME_SHOWN]} {reason}")
+                raise InputError(f"{path.name}: its part {info.filename[:_NAME_LENGTH_MAX]} {reason}")
         return
     with open_binary(path) as stream:
-        begin = io.BytesIO(stream.read(_LARGEST_PICKLE))
+        begin = io.BytesIO(stream.read(_PICKLE_SIZE_MAX))
     try:
         for _ in range(_LEGACY_PICKLES):
             for _ in pickletools.genops(begin):
                 pass
     except (ValueError, IndexError, OverflowError, MemoryError):  # damaged, which torch reports, or cut off here
-        if begin.getbuffer().nbytes == _LARGEST_PICKLE == begin.tell():
+        if begin.getbuffer().nbytes == _PICKLE_SIZE_MAX == begin.tell():
             raise InputError(refusal) from None
 
 
-def _plain_numbers(torch: Any) -> Any:
+def _admit_plain_numbers(torch: Any) -> Any:
     """Admit NumPy scalars, which the schedules of splatfacto store among learning rates."""
     if tuple(map(int, torch.__version__.split(".")[:2])) < (2, 6):
         return nullcontext()  # cannot name the types that older versions of NumPy wrote
@@ -205,7 +219,17 @@ def _plain_numbers(torch: Any) -> Any:
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
 
 
-def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointPart:
+def _read_content(content: object, size: int, sh_degree: int | None) -> _CheckpointPart:
+    """Find the splats in an unpickled checkpoint.
+
+    Args:
+        content: what torch loaded.
+        size: size of the file in bytes, an upper limit of the values of a tensor.
+        sh_degree: as for `_open_checkpoint`.
+
+    Raises:
+        InputError: there are no splats, several models, or tensors that are no splats.
+    """
     inria = _inria_tensors(content)
     if inria is not None:
         return _checked_part(inria, size, sh_degree)
@@ -215,12 +239,13 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
         return _checked_part(content["splats"], size, sh_degree)
     holder = next((content[name] for name in _HOLDERS if isinstance(content.get(name), Mapping)), content)
     named = {str(name): value for name, value in holder.items()}
-    models = _models_in(named)
+    models = _find_models(named)
     if len(models) > 1:
-        shown = ", ".join(f"{prefix}* ({_count(means)})" for prefix, means in list(models.items())[:_NAMED])
+        listed = list(models.items())[:_NAMES_SHOWN]
+        shown = ", ".join(f"{prefix}* ({_describe_count(means)})" for prefix, means in listed)
         raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save only one of them")
     if not models:
-        names = ", ".join(map(str, list(content)[:_NAMED]))
+        names = ", ".join(map(str, list(content)[:_NAMES_SHOWN]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
     (prefix,) = models
     tensors = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
@@ -233,14 +258,18 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
 
 
 def _inria_tensors(content: object) -> dict[str, Any] | None:
-    """Return the splats of a checkpoint of INRIA's trainer, a pair of `capture`'s result and the iteration."""
+    """Return the splats of a checkpoint of INRIA's trainer, a pair of `capture`'s result and the iteration.
+
+    Returns:
+        Tensors by gsplat's names; `None` for contents of another form.
+    """
     captured = content[0] if isinstance(content, tuple) and len(content) == 2 else None
     if not isinstance(captured, tuple) or len(captured) <= len(_INRIA) or not hasattr(captured[1], "numel"):
         return None
     return dict(zip(_INRIA, captured[1:], strict=False))
 
 
-def _models_in(named: Mapping[str, Any]) -> dict[str, Any]:
+def _find_models(named: Mapping[str, Any]) -> dict[str, Any]:
     """Return the means of each model of splats, by the prefix of the names of its tensors.
 
     It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, `gaussian_model.gaussians.` in Gaussian
@@ -258,13 +287,23 @@ def _models_in(named: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _count(means: Any) -> str:
+def _describe_count(means: Any) -> str:
+    """Return the number of splats in words, for a message; means may be anything, since they are not yet checked."""
     shape = getattr(means, "shape", None)
     return counted(shape[0], "splat") if shape else "no tensor"
 
 
 def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _CheckpointPart:
-    """Return the splats of tensors; refuse expanded tensors that are larger than the file."""
+    """Check tensors named as in gsplat, and return their splats; one or two scales per splat are completed to three.
+
+    Args:
+        splats: the tensors; values of other names are ignored, `filter_3D` with a finding.
+        size: size of the file in bytes; an expanded tensor may claim more values.
+        sh_degree: as for `_open_checkpoint`.
+
+    Raises:
+        InputError: a tensor is absent, is larger than the file, or has another shape or too many bands.
+    """
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)
         if name in splats and (numbers is None or numbers() > size):
@@ -277,7 +316,7 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
                 raise InputError(f"shN has {too_many_bands(degree)}")
             splats = {**splats, "shN": shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]}
     findings = []
-    splats = {name: _array(value) if name in _NAMES.values() else value for name, value in splats.items()}
+    splats = {name: _to_array(value) if name in _NAMES.values() else value for name, value in splats.items()}
     scales = splats.get("scales")
     if scales is not None and scales.ndim in (1, 2) and scales.size == len(scales):
         splats["scales"] = scales = np.repeat(scales.reshape(-1, 1), 3, axis=1)
@@ -298,7 +337,7 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     return _CheckpointPart(model, arrays, 2 if is_flat else 3, findings)
 
 
-def _array(value: Any) -> Any:
+def _to_array(value: Any) -> Any:
     """Return a tensor as an array: float64 if it is, else float32."""
     if hasattr(value, "detach"):
         value = value.detach().cpu()
@@ -308,8 +347,8 @@ def _array(value: Any) -> Any:
 
 FORMAT = Format(
     name="checkpoint",
-    open=_open,
-    open_bands=_open,
+    open=_open_checkpoint,
+    open_bands=_open_checkpoint,
     degree=MAX_SH_DEGREE,
     exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
 )

@@ -54,16 +54,18 @@ class TorchLoss:
         return TorchLossValue(torch.stack([loss, l1, ssim, mse])), slope.contiguous()
 
     def _ssim(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean SSIM of images [3, H, W], and the gradient of its sum by the first."""
+        """Return the mean SSIM of images [3, H, W], and the gradient [3, H, W] of its sum by the first."""
         m1, m2, e11, e22, e12 = self._blur(torch.cat([x, y, x * x, y * y, x * y])).reshape(5, *x.shape)
         a, b = 2.0 * m1 * m2 + C1, 2.0 * (e12 - m1 * m2) + C2
         c, d = m1 * m1 + m2 * m2 + C1, (e11 - m1 * m1) + (e22 - m2 * m2) + C2
-        over = 1.0 / (c * d)
-        ssim = a * b * over
-        by_square, by_product = -ssim / d, 2.0 * a * over
-        by_mean = 2.0 * m2 * b * over - 2.0 * m1 * ssim / c - 2.0 * m1 * by_square - m2 * by_product
-        p0, p1, p2 = self._blur(torch.cat([by_mean, 2.0 * by_square, by_product])).reshape(3, *x.shape)
-        return ssim.mean(), p0 + x * p1 + y * p2
+        over_cd = 1.0 / (c * d)
+        ssim = a * b * over_cd
+        by_square, by_product = -ssim / d, 2.0 * a * over_cd
+        by_mean = 2.0 * m2 * b * over_cd - 2.0 * m1 * ssim / c - 2.0 * m1 * by_square - m2 * by_product
+        # The window is symmetric, so the blur is its own transpose.
+        partials = self._blur(torch.cat([by_mean, 2.0 * by_square, by_product])).reshape(3, *x.shape)
+        by_mean, by_square, by_product = partials
+        return ssim.mean(), by_mean + x * by_square + y * by_product
 
     def _blur(self, planes: Tensor) -> Tensor:
         """Blur planes [C, H, W], with zeros beyond the border."""
@@ -92,14 +94,14 @@ class DeviceImages:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._left: float = np.inf
+        self._bytes_left: float = np.inf
         if device.type == "cuda":
-            self._left = _IMAGE_SHARE * torch.cuda.get_device_properties(device).total_memory
+            self._bytes_left = _IMAGE_SHARE * torch.cuda.get_device_properties(device).total_memory
         self._kept: dict[int, tuple[Any, Tensor]] = {}  # by identity; the image is kept, so that no other takes its id
 
     def reference(self, image: PosedImage | NDArray[Any], background: Tensor) -> Tensor:
         """Return an image [H, W, 3] float32, or the values of an array, in front of a background [3]."""
-        pixels = self._stored(image, image.pixels if isinstance(image, PosedImage) else image)
+        pixels = self._on_device(image, image.pixels if isinstance(image, PosedImage) else image)
         if pixels.dtype != torch.uint8:
             return pixels.float()
         values = pixels.float() * (1.0 / 255.0)
@@ -110,15 +112,16 @@ class DeviceImages:
 
     def mask(self, mask: NDArray[np.bool_] | None) -> Tensor | None:
         """Return a mask [H, W]."""
-        return None if mask is None else self._stored(mask, mask)
+        return None if mask is None else self._on_device(mask, mask)
 
-    def _stored(self, key: Any, array: NDArray[Any]) -> Tensor:
+    def _on_device(self, key: Any, array: NDArray[Any]) -> Tensor:
+        """Return an array on the device, where it stays while there is room; `key` is the object it belongs to."""
         kept = self._kept.get(id(key))
         if kept is not None:
             return kept[1]
         tensor = torch.from_numpy(np.require(array, requirements=["C", "W"])).to(self._device)
-        if array.nbytes <= self._left:
-            self._left -= array.nbytes
+        if array.nbytes <= self._bytes_left:
+            self._bytes_left -= array.nbytes
             self._kept[id(key)] = (key, tensor)
         return tensor
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from csplat.encoder import FixedQuantisation
 from csplat_trainer.gsplat_rasteriser import Tensors
 
-_ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")
+_ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # √2, rounded to float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +95,14 @@ class TorchQuantisers:
         by_splat, turns = scales, quats
         if self.shape_rows is not None:
             by_splat, turns = scales[self.shape_rows] + sizes[:, None], quats[self.shape_rows]
-        sh0 = self._colours(values["sh0"], plan.sh0_step, None)
+        sh0 = self._colour_integers(values["sh0"], plan.sh0_step, None)
         sh = self._sh_integers(values["shN"])
-        decoded_sh = self._lifted(sh, plan.sh_step)
+        decoded_sh = self._lift_colours(sh, plan.sh_step)
         decoded = {
             "means": means.float(),
-            "quats": self._rotations(turns),
+            "quats": self._dequantise_quats(turns),
             "scales": (by_splat.double() * plan.scale_step).float(),
-            "sh0": self._lifted(sh0, plan.sh0_step),
+            "sh0": self._lift_colours(sh0, plan.sh0_step),
             "shN": decoded_sh if self.sh_rows is None else decoded_sh[self.sh_rows],
         }
         return QuantisedValues(scales, quats, sizes, opacities, sh0, sh, decoded, self._alphas[opacities])
@@ -119,43 +119,47 @@ class TorchQuantisers:
             values["sizes"].masked_fill_(self._own_shapes, 0.0)
 
     def _scale_integers(self, scales: Tensor) -> Tensor:
+        """Return the integers of log-scales [S, 3]; the quotient is float32 for entries, float64 for other rows."""
         shared = torch.round(scales[: self._shapes] / self._scale_step32).int()
         own = torch.round(scales[self._shapes :].double() / self._scale_step64).int()
         return torch.cat([shared, own])
 
     def _quat_integers(self, quats: Tensor) -> Tensor:
+        """Return the integers of x, y, z [S, 3], rounded towards 0 if w would be the root of a negative number."""
         levels = self._plan.quat_levels
         scaled = quats[:, 1:] * float(np.float32(levels * _ROOT2))
         q = torch.round(scaled).int().clamp(-levels, levels)
         beyond = q.long().square().sum(dim=1, keepdim=True) > 2 * levels * levels
         return torch.where(beyond, torch.trunc(scaled).int(), q)
 
-    def _rotations(self, q: Tensor) -> Tensor:
+    def _dequantise_quats(self, q: Tensor) -> Tensor:
+        """Return quaternions [S, 4] of unit length from the integers of x, y, z [S, 3]; w is not negative."""
         levels = self._plan.quat_levels
         c, wide = 1.0 / (levels * _ROOT2), q.double()
         w = torch.sqrt(2.0 * levels * levels - wide.square().sum(dim=1, keepdim=True)) * c
         return torch.cat([w, wide * c], dim=1).float()
 
     def _sh_integers(self, sh: Tensor) -> Tensor:
+        """Return Y, Co, Cg of rows of SH, [R, K, 3]; all but codebook entries are rounded to the coarse multiples."""
         if self.sh_rows is None:
-            return self._colours(sh, self._plan.sh_step, self._coarse)
-        entries = self._colours(sh[: self._entries], self._plan.sh_step, None)
-        return torch.cat([entries, self._colours(sh[self._entries :], self._plan.sh_step, self._coarse)])
+            return self._colour_integers(sh, self._plan.sh_step, self._coarse)
+        entries = self._colour_integers(sh[: self._entries], self._plan.sh_step, None)
+        return torch.cat([entries, self._colour_integers(sh[self._entries :], self._plan.sh_step, self._coarse)])
 
-    def _colours(self, rgb: Tensor, step: float, coarse: Tensor | None) -> Tensor:
-        """Return Y, Co, Cg [..., 3]; see `colour_integers`."""
+    def _colour_integers(self, rgb: Tensor, step: float, coarse: Tensor | None) -> Tensor:
+        """Return Y, Co, Cg [..., 3] as integers, multiples of 2**coarse if that is given; see `colour_integers`."""
         shift = self._plan.chroma_shift
         r, g, b = (rgb * float(np.float32(1.0 / step))).unbind(dim=-1)
         fraction = 0.5**shift
-        co = _multiples((r - b) * fraction, coarse)
-        cg = _multiples((g - (r + b) * 0.5) * fraction, coarse)
+        co = _round_to_multiples((r - b) * fraction, coarse)
+        cg = _round_to_multiples((g - (r + b) * 0.5) * fraction, coarse)
         full_co, full_cg = co << shift, cg << shift
-        rest = ((r + g + b).double() - (full_cg + full_co - 2 * (full_co >> 1))).float() / self._three
-        rest = (rest.double() + (full_cg >> 1)).float()
-        return torch.stack([_multiples(rest, coarse), co, cg], dim=-1)
+        y = ((r + g + b).double() - (full_cg + full_co - 2 * (full_co >> 1))).float() / self._three
+        y = (y.double() + (full_cg >> 1)).float()
+        return torch.stack([_round_to_multiples(y, coarse), co, cg], dim=-1)
 
-    def _lifted(self, columns: Tensor, step: float) -> Tensor:
-        """Return decoded colours [..., 3]; see `lift_colour`."""
+    def _lift_colours(self, columns: Tensor, step: float) -> Tensor:
+        """Return decoded red, green, blue [..., 3] from Y, Co, Cg [..., 3]; see `lift_colour`."""
         shift = self._plan.chroma_shift
         y, co, cg = columns.unbind(dim=-1)
         co, cg = co << shift, cg << shift
@@ -167,7 +171,8 @@ class TorchQuantisers:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
 
-def _multiples(values: Tensor, coarse: Tensor | None) -> Tensor:
+def _round_to_multiples(values: Tensor, coarse: Tensor | None) -> Tensor:
+    """Round values to int32 multiples of 2**coarse, which is broadcast to their shape; `None`: to integers."""
     if coarse is None:
         return torch.round(values).int()
     return torch.round(values * torch.exp2(-coarse.float())).int() << coarse

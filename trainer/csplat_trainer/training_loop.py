@@ -40,6 +40,8 @@ _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
 _KEPT_AT_ONCE = 0.85  # fraction of the splats kept by a late pruning
 _STEPS_BETWEEN = 100  # steps after each late pruning, or 1 % of the iterations
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
+_EXPONENT_MAX = 700.0  # largest exponent whose exponential fits float64
+_DOUBLING = 2.0  # growth of a resumed scene with too few splats, until it has enough
 _FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
 
@@ -84,7 +86,15 @@ def train(
 
 
 class _Training:
-    """A training by a `Fitter`: its images, engine and strategy."""
+    """A training by a `Fitter`: its images, engine and strategy.
+
+    Args:
+        data, options, outputs, context: as for `train`.
+        show: called with the progress, every `log_every` steps and after the last.
+
+    Raises:
+        InputError: as for `train`; the images and the checkpoint are read here, before the first step.
+    """
 
     def __init__(
         self,
@@ -104,13 +114,13 @@ class _Training:
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
         if outputs.resume is None:
-            parameters = Parameters.starting_at(self._start(self._scene))
+            parameters = Parameters.starting_at(self._place_splats(self._scene))
             self._log["growth"] = options.growth_from(len(parameters))
         else:
             parameters = self._resume(outputs.resume)
-        self._lpips = _lpips(options, outputs)
+        self._lpips = _load_lpips_weights(options, outputs)
         extent_factor = min(1.0, _LARGE_EXTENT / self._scene.extent)
-        self._engine = _engine(
+        self._engine = _make_engine(
             parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips, context
         )
         self._colour = _COLOURS.get(options.background, data.background)
@@ -134,14 +144,14 @@ class _Training:
             background = fitter.rng.random(3, dtype=np.float32)
         rates = self._options.learning_rates(fitter.iteration, self._scene.extent)
         gain = fitter.gain(view, rates["exposure"])
-        return self._engine.step(self._image(view), background, self._degree, rates, fitter.rng, gain)
+        return self._engine.step(self._training_image(view), background, self._degree, rates, fitter.rng, gain)
 
     def after_step(self) -> None:
         fitter, options, outputs = self._fitter, self._options, self._outputs
         if options.refines_after(fitter.iteration):
             self._refine()
-        if times := options.prunings_left(fitter.iteration):
-            self._prune(times)
+        if prunings_left := options.prunings_left(fitter.iteration):
+            self._prune(prunings_left)
         if fitter.is_due(options.log_every) or fitter.is_last:
             self._report()
         if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
@@ -156,7 +166,12 @@ class _Training:
         """SH degree of the current step."""
         return self._options.active_degree(self._fitter.iteration - 1)
 
-    def _start(self, scene: SceneExtent) -> dict[str, F32]:
+    def _place_splats(self, scene: SceneExtent) -> dict[str, F32]:
+        """Return the initial parameters.
+
+        Their number is `initial_splats`, at most the cap. If that is 0, it is the cap if it does not grow, else the
+        number of points or, without points, `_FIRST_FRACTION` of the cap.
+        """
         options, data = self._options, self._data
         count = options.initial_splats
         if count == 0 and options.strategy in ("fixed", "none"):
@@ -176,8 +191,13 @@ class _Training:
         )
 
     def _resume(self, path: str | Path) -> Parameters:
+        """Set the fitter to the state of a checkpoint, and return its parameters, adapted to the options.
+
+        Raises:
+            InputError: the file is damaged or of another kind.
+        """
         checkpoint = load_checkpoint(path)
-        check_arrays(path, checkpoint.parameters.values, _shapes(checkpoint.parameters.values))
+        check_arrays(path, checkpoint.parameters.values, _expected_shapes(checkpoint.parameters.values))
         self._fitter.resume(checkpoint)
         origin = np.array(checkpoint.own.get("origin"), np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():
@@ -188,8 +208,8 @@ class _Training:
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
         return fit_to_options(checkpoint.parameters, self._options, self._fitter.rng)
 
-    def _image(self, number: int) -> PosedImage:
-        """Return a training image, at half its size in the first steps if requested."""
+    def _training_image(self, number: int) -> PosedImage:
+        """Return a training image, in the first steps at half its size if requested; halved images are kept."""
         if not self._options.is_half_size(self._fitter.iteration):
             self._halved.clear()
             return self._data.train[number]
@@ -198,6 +218,7 @@ class _Training:
         return self._halved[number]
 
     def _refine(self) -> None:
+        """Change the number and positions of splats, as the strategy requires after this step."""
         options, parameters = self._options, self._engine.parameters
         if options.strategy == "gradient":
             assert self._engine.screen is not None
@@ -210,6 +231,7 @@ class _Training:
                 options.dead_opacity,
                 self._fitter.rng,
             )
+            # The last reset leaves half a period to restore the opacities.
             if self._fitter.is_due(_RESET_EVERY) and self._fitter.iteration + _RESET_EVERY / 2 < options.iterations:
                 reset_opacities(parameters)
             self._engine.screen.clear(len(parameters))
@@ -218,11 +240,16 @@ class _Training:
             if options.strategy == "mcmc":
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._fitter.rng)
 
-    def _prune(self, times: int) -> None:
-        """Make the first of a number of equal prunings towards the final fraction."""
+    def _prune(self, prunings_left: int) -> None:
+        """Make the first of a number of prunings, each of the same fraction, towards the final number of splats.
+
+        The log keeps the number of splats before the first pruning, of which `final_share` remains.
+        """
         options, parameters = self._options, self._engine.parameters
         final = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
-        count = len(parameters) * math.pow(final / len(parameters), 1.0 / times) if times > 1 else final
+        count = final
+        if prunings_left > 1:
+            count = len(parameters) * math.pow(final / len(parameters), 1.0 / prunings_left)
         kept_count = max(1, round(count))
         if kept_count >= len(parameters):
             return
@@ -241,12 +268,13 @@ class _Training:
         final = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
         if final >= count:
             return
-        times, begin = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE)), fitter.seconds
-        for left in range(times, 0, -1):
-            self._prune(left)
+        pruning_count = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE))
+        begin = fitter.seconds
+        for done in range(1, pruning_count + 1):
+            self._prune(pruning_count - done + 1)
             for _ in range(max(_STEPS_BETWEEN, self._options.iterations // 100)):
                 fitter.step(self)
-            self._report((fitter.seconds - begin) / (times - left + 1) * (left - 1))
+            self._report((fitter.seconds - begin) / done * (pruning_count - done))
 
     def _report(self, seconds_left: float | None = None) -> None:
         """Add an entry to the log, and show it; arguments as for `Fitter.report`."""
@@ -257,6 +285,7 @@ class _Training:
         self._show(now)
 
     def _evaluate(self, views: int) -> dict[str, Any]:
+        """Score on `views` test images, evenly spread, or all for 0; add the scores to the log, and return them."""
         degree = self._options.active_degree(self._fitter.iteration)
         test = list(self._data.test)
         if views and views < len(test):
@@ -268,6 +297,7 @@ class _Training:
         return metrics
 
     def _preview(self) -> None:
+        """Write the first test image, or training image if there are none, next to its render."""
         assert self._outputs.previews is not None
         folder = Path(self._outputs.previews)
         folder.mkdir(parents=True, exist_ok=True)
@@ -278,6 +308,7 @@ class _Training:
         save_image(folder / f"{self._fitter.iteration:06d}.png", side_by_side(target, rendered))
 
     def _save(self) -> None:
+        """Write a checkpoint; `outputs.checkpoint` must not be `None`."""
         assert self._outputs.checkpoint is not None
         self._fitter.save(
             self._outputs.checkpoint, "train", asdict(self._options), self._engine.parameters.on_cpu(),
@@ -285,6 +316,7 @@ class _Training:
         )  # fmt: skip
 
     def _model(self) -> SplatModel:
+        """Return the scene, with the training's record, up direction and origin, and a first view of surroundings."""
         model = to_model(self._engine.parameters.on_cpu().values, antialiased=self._options.antialiased)
         entries = {TRAINING: self._data.trained_on(self._colour).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
@@ -293,6 +325,7 @@ class _Training:
         return replace(model, metadata=metadata, origin=self._data.origin)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
+        """Return the log of the steps with facts on the run; gains and biases of images if they were trained."""
         return {
             "csplat": csplat.__version__,
             "machine": platform.machine(),
@@ -328,11 +361,12 @@ def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator
         parameters.keep(_most_visible(parameters, options.max_splats))
     elif options.strategy == "fixed":
         while 0 < len(parameters) < options.max_splats:
-            grow(parameters, 2.0, options.max_splats, options.dead_opacity, rng)
+            grow(parameters, _DOUBLING, options.max_splats, options.dead_opacity, rng)
     return parameters
 
 
 def _fit_degree(part: ParameterArrays, degree: int) -> None:
+    """Truncate `shN` of values or moments to an SH degree, or extend it by zeros; the array is replaced."""
     coefficients = (degree + 1) ** 2 - 1
     old = part["shN"]
     if old.shape[1] == coefficients:
@@ -344,12 +378,13 @@ def _fit_degree(part: ParameterArrays, degree: int) -> None:
 
 
 def _most_visible(parameters: Parameters, count: int) -> I64:
+    """Return the ascending indices of the `count` splats with the most opacity times area of the two longer axes."""
     longer = np.sort(parameters.values["scales"].astype(np.float64), axis=1)[:, 1:]
-    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # the exponential fits float64
+    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), _EXPONENT_MAX))
     return np.sort(np.argsort(-weight, kind="stable")[:count])
 
 
-def _shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
+def _expected_shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
     """Return the expected shapes of parameters by the number of logits and of SH coefficients."""
     sh = values["shN"].shape[1:] if "shN" in values else ()
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "logits": (), "sh0": (3,), "shN": (*sh[:1], 3)}
@@ -366,7 +401,7 @@ def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
     return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}")}
 
 
-def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
+def _load_lpips_weights(options: TrainOptions, outputs: Outputs) -> Lpips | None:
     """Return the weights of LPIPS; `None` if they are absent and not required."""
     try:
         return load_lpips(outputs.lpips_weights)
@@ -376,7 +411,12 @@ def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
         return None
 
 
-def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None, context: Context) -> Engine:
+def _make_engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None, context: Context) -> Engine:
+    """Return the engine of the requested device.
+
+    Raises:
+        InputError: it does not support an option, or a package or the GPU is absent.
+    """
     if options.device == "cpu":
         perceptual = PerceptualLoss(lpips) if options.lpips_weight > 0.0 and lpips is not None else None
         return CpuEngine(parameters, options, perceptual, context=context)

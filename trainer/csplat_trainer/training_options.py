@@ -167,9 +167,11 @@ class TrainOptions:
         """
         begin = min(self.refine_end, self.iterations - 1)
         steps = max(1, int(_PRUNING_FRACTION * (self.iterations - begin)))
-        times = min(_MAX_PRUNINGS, steps)
-        done, rest = divmod(iteration - begin, steps // times)
-        return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
+        pruning_count = min(_MAX_PRUNINGS, steps)
+        number, steps_since = divmod(iteration - begin, steps // pruning_count)  # of the pruning, from 1
+        if self.final_share >= 1.0 or steps_since > 0 or number <= 0:
+            return 0
+        return max(0, pruning_count + 1 - number)
 
     def growth_from(self, count: int) -> float:
         """Return the growth factor per action of a run that starts with `count` splats."""
@@ -189,8 +191,9 @@ class TrainOptions:
         means = self.lr_means
         if means > 0.0:
             means *= (self.lr_means_final / means) ** done if self.lr_means_final > 0.0 else 1.0 - done
-        left = max(0, iteration - self.refine_end) / max(1, self.iterations - self.refine_end)
-        decay = self.lr_decay + (1.0 - self.lr_decay) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, left)))
+        # Fraction of the steps after the end of the strategy, over which the rates fall along half a cosine.
+        refined = max(0, iteration - self.refine_end) / max(1, self.iterations - self.refine_end)
+        decay = self.lr_decay + (1.0 - self.lr_decay) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, refined)))
         return {
             "means": means * extent,
             "quats": self.lr_quats * decay,

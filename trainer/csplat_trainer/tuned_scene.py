@@ -42,10 +42,10 @@ class TunedScene:
         self.fixed = fixed
         self.parameters = parameters or initial_parameters(fixed)
         values, book, shapes = self.parameters.values, fixed.book, fixed.shapes
-        self._users = None if book is None else _users(book.index, book.size)
+        self._users = None if book is None else _group_by_entry(book.index, book.size)
         self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
         self._rows_gradient = np.zeros_like(values["shN"] if book else values["shN"][:0])
-        self._shape_users = None if shapes is None else _users(shapes.index, shapes.size)
+        self._shape_users = None if shapes is None else _group_by_entry(shapes.index, shapes.size)
         self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
 
     @property
@@ -54,6 +54,7 @@ class TunedScene:
         return self._free_values(sigmoid(self.parameters.values["logits"]))
 
     def _free_values(self, alphas: F32) -> FreeValues:
+        """Return the parameters' own arrays, with these opacities [N] in place of the logits."""
         v = self.parameters.values
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
@@ -101,7 +102,11 @@ class TunedScene:
         self.fixed.constrain(self._free_values(alphas))
 
     def _by_row(self, by_splat: F32) -> F32:
-        """Return the gradients of the file's rows of SH, given the gradients of all splats [N, K, 3]."""
+        """Return the gradients of the file's rows of SH, [R, K, 3], given those of all splats [N, K, 3].
+
+        With a codebook, rows are its entries, then the escaped splats, and the next call overwrites the result.
+        Without, rows are splats.
+        """
         book = self.fixed.book
         if book is None or self._users is None:
             return by_splat
@@ -111,7 +116,11 @@ class TunedScene:
         return rows
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
-        """Return the gradients of the file's rotations [S, 4] and scales [S, 3], and of log-scale offsets [N]."""
+        """Return the gradients of the file's rotations [S, 4] and scales [S, 3], and of the sizes of splats.
+
+        With a shape codebook, rows are its entries, then the escaped splats, and sizes are offsets [N] of all three
+        log-scales. Without, S is N, and there are no sizes: [0].
+        """
         shapes = self.fixed.shapes
         if shapes is None or self._shape_users is None:
             return gradients.quats, gradients.scales, np.zeros(0, np.float32)
@@ -139,14 +148,24 @@ def initial_parameters(fixed: FixedQuantisation) -> Parameters:
     )
 
 
-def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
-    """Return splats sorted by entry, escaped splats last, and the start of each entry, [size + 1]."""
+def _group_by_entry(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
+    """Group splats by their entry of a codebook.
+
+    Args:
+        index: [N], entry of each splat; `size` for escaped splats.
+        size: number of entries.
+
+    Returns:
+        [N], splats sorted by entry, escaped splats last; and [size + 1], position there of the first splat of each
+        entry, and of the first escaped splat.
+    """
     order = np.argsort(index, kind="stable")
     starts = np.searchsorted(index[order], np.arange(size + 1))
     return order.astype(np.int64), starts.astype(np.int64)
 
 
 def _sum_by_entry(values: F32, order: I64, starts: I64, size: int) -> F32:
+    """Return the sums of values [N, ...] over the splats of each entry, [size, ...]; see `sum_by_entry`."""
     flat = np.empty((size, values[0].size), np.float32)
     sum_by_entry(values.reshape(len(values), -1), order, starts, flat)
     return flat.reshape(size, *values.shape[1:])
@@ -165,8 +184,8 @@ def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, ou
     for entry in range(lane, out.shape[0], lanes):
         total = out[entry]
         total[:] = np.float32(0.0)
-        for at in range(starts[entry], starts[entry + 1]):
-            row = values[order[at]]
+        for position in range(starts[entry], starts[entry + 1]):
+            row = values[order[position]]
             for c in range(out.shape[1]):
                 total[c] += row[c]
 
@@ -180,6 +199,8 @@ def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
 MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
 _ROWS = 1 << 15  # rows of SH to count at a time; their integers take several times the memory of the values
 _MAX_SLOPE = 4.0  # bits per step; frequencies of rare integers are too uncertain for larger slopes
+_FRACTION_MIN = 1e-12  # for the logarithm of frequencies of 0, which count 0 times
+_INTEGER_LIMIT = 2.0**30  # fits int32
 _ROOT2 = np.sqrt(2.0)
 
 
@@ -231,16 +252,17 @@ class RateTerm:
                 "sh0": colour_integers_of(stored.sh0[rows, None], grade.sh0_step, plan.chroma_shift).reshape(-1, 3),
             }
             for name, values in columns.items():
-                costs._count(_table_name(name, number), [values])
-        costs._count("sizes", [_integers(stored.sizes[:, None], plan.scale_step)])
+                costs._count_table(_table_name(name, number), [values])
+        costs._count_table("sizes", [_integers(stored.sizes[:, None], plan.scale_step)])
         width = 3 * stored.sh.shape[1]
         if width:
-            parts = (stored.sh[at : at + _ROWS] for at in range(0, max(1, len(stored.sh)), _ROWS))
+            parts = (stored.sh[first : first + _ROWS] for first in range(0, max(1, len(stored.sh)), _ROWS))
             coloured = (colour_integers_of(part, plan.sh_step, plan.chroma_shift) for part in parts)
-            costs._count("shN", (part.reshape(-1, width) for part in coloured))
+            costs._count_table("shN", (part.reshape(-1, width) for part in coloured))
         return costs
 
-    def _count(self, name: str, parts: Iterable[NDArray[Any]]) -> None:
+    def _count_table(self, name: str, parts: Iterable[NDArray[Any]]) -> None:
+        """Set the table `name` to the slopes of integers [n, C] in parts, and add their bits."""
         self.tables[name], bits = slopes_of(count_integers(parts))
         self.bits += bits
 
@@ -279,7 +301,13 @@ class RateTerm:
 
 @dataclass(frozen=True)
 class _ClassSteps:
-    """Consecutive rows with the same quantisation steps; all rows without quantisation classes."""
+    """Consecutive rows with the same quantisation steps; all rows without quantisation classes.
+
+    Attributes:
+        rows: the rows of splats.
+        scale_step, quat_step, sh0_step: difference of values whose integers differ by 1.
+        levels: integer of the opacity 1, whose root is quantised.
+    """
 
     rows: slice
     scale_step: float
@@ -289,6 +317,7 @@ class _ClassSteps:
 
 
 def _class_steps(fixed: FixedQuantisation) -> list[_ClassSteps]:
+    """Return the steps of each quantisation class; classes are runs of tiles, and so of rows."""
     plan, tiles = fixed.parameters, fixed.encode_plan.tiles
     begins = [0] if fixed.encode_plan.classes is None else [
         number for number, tile in enumerate(tiles) if not number or tile.factors != tiles[number - 1].factors
@@ -310,6 +339,7 @@ def _class_steps(fixed: FixedQuantisation) -> list[_ClassSteps]:
 
 
 def _table_name(name: str, number: int) -> str:
+    """Return the name of an attribute's table for a quantisation class; the first has the attribute's own name."""
     return f"{name} {number}" if number else name
 
 
@@ -346,7 +376,7 @@ def slopes_of(counts: I64) -> tuple[F32, float]:
     bits = -np.log2(blurred / (count + size))
     slopes = np.gradient(bits, axis=1)
     fractions = counts / max(1, count)
-    entropy = -(counts * np.log2(np.maximum(fractions, 1e-12))).sum()
+    entropy = -(counts * np.log2(np.maximum(fractions, _FRACTION_MIN))).sum()
     return np.clip(slopes, -_MAX_SLOPE, _MAX_SLOPE).astype(np.float32), float(entropy)
 
 
@@ -361,14 +391,24 @@ def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
 
 
 def _integers(seen: F32, step: float) -> I32:
-    return np.rint(np.clip(seen.astype(np.float64) / step, -(2.0**30), 2.0**30)).astype(np.int32)
+    """Return the integers of decoded values of any shape, limited to ± `_INTEGER_LIMIT`."""
+    return np.rint(np.clip(seen.astype(np.float64) / step, -_INTEGER_LIMIT, _INTEGER_LIMIT)).astype(np.int32)
 
 
 @parallel_kernel()
 def _add_plain(
     lane: int, lanes: int, seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32
 ) -> None:
-    """Add the slopes of plain columns, [n, C] from column `first` on; parallel over runs of rows."""
+    """Add the slopes of columns that are quantised one by one; parallel over runs of rows.
+
+    Args:
+        seen: [n, C], decoded values.
+        step: their quantisation step.
+        first: number of columns to skip, which have no table.
+        tables: [C - first, 2 · MAX_INTEGER + 1], slopes in bits per step.
+        per_bit: loss per bit.
+        out: [n, C], gradients of the loss; incremented.
+    """
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     begin, end = lane_range(lane, lanes, seen.shape[0])
@@ -383,7 +423,16 @@ def _add_plain(
 def _add_colour(
     lane: int, lanes: int, seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32
 ) -> None:
-    """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; parallel over runs of rows."""
+    """Add the slopes of colours through the transform to luma and chroma; parallel over runs of rows.
+
+    Args:
+        seen: [n, K, 3], decoded red, green, blue.
+        step: quantisation step of the luma.
+        shift: the chroma's step is coarser by 2**shift.
+        tables: [3 K, 2 · MAX_INTEGER + 1], slopes of Y, Co, Cg in bits per step.
+        per_bit: loss per bit.
+        out: [n, K, 3], gradients of the loss; incremented.
+    """
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     chroma = np.float32(0.5**shift)

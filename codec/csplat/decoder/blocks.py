@@ -325,6 +325,7 @@ def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
 
 
 def _check_level(level: int, low: int, high: int, at: int, clause: str) -> None:
+    """Raise E_RANGE with the clause unless a quantisation level is in `low`..`high`."""
     if not low <= level <= high:
         raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=level, wanted=f"{low} to {high}")
 

@@ -79,6 +79,7 @@ def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
 
 
 def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
+    """Return the directory records of the codebook chunks, in the order of the directory."""
     return [record for record in header.directory if record.type == _spec.CHUNK_CODEBOOK]
 
 

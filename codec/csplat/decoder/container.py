@@ -289,6 +289,7 @@ def open_chunk(
 
 
 def _check_crc(covered: memoryview, stored: int, at: int, clause: str) -> None:
+    """Raise E_CRC with the clause unless the CRC-32 of `covered` is `stored`, which is at offset `at`."""
     computed = zlib.crc32(covered)
     if computed != stored:
         raise FormatError(_spec.ERROR_CRC, at, clause, f"found {stored:#010x}, computed {computed:#010x}")

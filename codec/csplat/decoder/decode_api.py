@@ -345,6 +345,7 @@ def prepare_decode(
 def _request_of(
     data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None, *, every_level: bool = False
 ) -> DecodeRequest:
+    """Parse the header of a whole file, and check what is to be decoded (`prepare_decode`)."""
     view = view_of(data)
     return prepare_decode(view, parse_header(view, whole=True), limits, tiles, sh_degree, every_level=every_level)
 

@@ -84,6 +84,7 @@ def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: i
 
 
 def _refuse(at: int, name: str, clause: str, value: object, wanted: object) -> None:
+    """Raise E_STREAM with the clause for the field `name` of the stream head at `at`."""
     raise FormatError(_spec.ERROR_STREAM, at + _OFFSETS[name], clause, name, found=value, wanted=wanted)
 
 
@@ -125,7 +126,11 @@ def _inflate(coded: memoryview, size: int, at: int) -> bytes:
 
 
 def _undo_run_length(packed: bytes | memoryview | Ints, size: int, at: int) -> Ints:
-    """Expand runs, stored as planes of values, low bytes and high bytes of lengths, to uint8 [size]."""
+    """Expand runs to uint8 [size]: planes of values, and of low and high bytes of lengths - 1.
+
+    Raises:
+        FormatError: E_CODER at the offset `at` of the coded bytes, if the lengths do not add up to `size` (TRF-1).
+    """
     data = np.frombuffer(packed, np.uint8)
     values, low, high = data.reshape(3, -1)
     lengths = high.astype(np.int64)

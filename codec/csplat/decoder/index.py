@@ -35,6 +35,7 @@ _SINGLE_END = 2.0**128 - 2.0**103  # the smallest number that binary32 rounds to
 
 _CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 _STEP_SIZE = 8  # bytes of a step, binary64
+_INDEX_CRC_SIZE = 4  # bytes of the CRC-32 that ends the index
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))  # control characters, forbidden in names (EXR-2)
 #: Record sizes in the index head and their minima, the sizes that this version reads.
 _RECORD_SIZES: Final = {
@@ -92,7 +93,8 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     directory_at = range(at, at + head.directory_count * head.directory_size, head.directory_size)
     directory = read_directory(view, directory_at)
     check_codebook_chunks(directory, directory_at, codebooks)
-    tiles = read_tiles(view, directory_at.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
+    means_step = attributes[_spec.ATTRIBUTE_MEANS - 1].step
+    tiles = read_tiles(view, directory_at.stop, end - _INDEX_CRC_SIZE, head, means_step, codebooks)
     _check_levels(tiles, directory, directory_at)
     check_coverage(directory, directory_at, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
@@ -152,7 +154,7 @@ def _check_room(head: _spec.IndexHead, index_size: int) -> None:
         + head.extra_count * head.extra_size
         + head.directory_count * head.directory_size
         + head.tile_count * head.tile_size
-        + 4
+        + _INDEX_CRC_SIZE
     )
     if least > index_size:
         detail, wanted = "the records do not fit into the index", f"at least {least} bytes"
@@ -312,6 +314,7 @@ def read_directory(view: memoryview, at: range) -> tuple[_spec.DirectoryRecord, 
 
 
 def _check_chunk_size(record: _spec.DirectoryRecord | _spec.LayerRecord, at: int, offsets: Mapping[str, int]) -> None:
+    """Check CHK-3: the chunk of a directory or layer record at offset `at` has room for its header."""
     if record.size < _spec.CHUNK_HEADER_SIZE:
         refuse_field(_spec.ERROR_INDEX, "CHK-3", record, at, offsets, "size", f"at least {_spec.CHUNK_HEADER_SIZE}")
 
@@ -486,6 +489,7 @@ def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head
 
 
 def _ends_early(at: int) -> NoReturn:
+    """Raise E_INDEX for a tile record, at offset `at`, that the index does not hold completely."""
     raise FormatError(_spec.ERROR_INDEX, at, "IDX-2", "the index ends within a tile")
 
 
@@ -494,7 +498,8 @@ def _read_layers(
 ) -> dict[int, _spec.LayerRecord]:
     """Return the layer records of a tile by layer, the first at `at`; check RES-2, TIL-2, TIL-3, TIL-5, CHK-3."""
     layers: dict[int, _spec.LayerRecord] = {}
-    offsets, last = _spec.LAYER_RECORD_OFFSETS, -1
+    offsets = _spec.LAYER_RECORD_OFFSETS
+    last = -1  # id of the previous layer
     for i in range(tile.layer_count):
         record_at = at + i * head.layer_size
         record = _spec.unpack_layer_record(view, record_at)

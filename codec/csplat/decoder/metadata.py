@@ -139,12 +139,12 @@ def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> 
             raise _RefusedError("byte order mark")
         value = json.loads(
             text.decode("utf-8"),
-            object_pairs_hook=_object,
-            parse_constant=_constant,
-            parse_float=_number,
-            parse_int=_integer,
+            object_pairs_hook=_parse_object,
+            parse_constant=_refuse_constant,
+            parse_float=_parse_number,
+            parse_int=_parse_integer,
         )
-        _check_tree(value)
+        _check_json_tree(value)
     except (ValueError, RecursionError) as error:
         reason = str(error) or type(error).__name__
         raise FormatError(_spec.ERROR_JSON, at, "JSN-1", reason) from None
@@ -187,6 +187,7 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
 
 
 def _read_text(data: File, kind: bytes, limits: Limits | None) -> Any:
+    """Return the parsed JSON of the file's chunk of type `kind`; as in `json_chunk`."""
     view = view_of(data)
     return json_chunk(view, parse_header(view, whole=True), kind, (limits or Limits()).json_bytes)
 
@@ -195,7 +196,7 @@ class _RefusedError(ValueError):
     """JSON that the `json` module accepts and JSN-1 forbids."""
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _parse_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the object of pairs from the `json` module; raise a `_RefusedError` if a name occurs twice."""
     result = dict(pairs)
     if len(result) != len(pairs):
@@ -203,11 +204,12 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _constant(name: str) -> None:
+def _refuse_constant(name: str) -> None:
+    """Raise a `_RefusedError`: `NaN` and `Infinity`, which the `json` module accepts, are not JSON."""
     raise _RefusedError(f"{name} is not JSON")
 
 
-def _number(digits: str) -> float:
+def _parse_number(digits: str) -> float:
     """Return the number of a decimal; raise a `_RefusedError` if it exceeds binary64."""
     value = float(digits)
     if not math.isfinite(value):
@@ -215,12 +217,16 @@ def _number(digits: str) -> float:
     return value
 
 
-def _integer(digits: str) -> int | float:
-    return int(digits) if len(digits) <= _INT_DIGITS else _number(digits)
+def _parse_integer(digits: str) -> int | float:
+    """Return the number of an integer; a float if it has more than `_INT_DIGITS` digits."""
+    return int(digits) if len(digits) <= _INT_DIGITS else _parse_number(digits)
 
 
-def _check_tree(value: Any) -> None:
-    """Refuse deep nesting and strings that are not Unicode text, without recursion."""
+def _check_json_tree(value: Any) -> None:
+    """Raise a `_RefusedError` for deep nesting, and a `ValueError` for strings that are not Unicode text.
+
+    Walks the tree level by level, because recursion would overflow on the nesting to be refused.
+    """
     level: list[Any] = [value]
     depth = 0
     while level:
@@ -233,7 +239,8 @@ def _check_tree(value: Any) -> None:
                 nested.extend(item)
             elif isinstance(item, str):
                 item.encode("utf-8")  # an unpaired surrogate (\ud800) raises ValueError
-        depth += any(isinstance(item, dict | list) for item in level)
+        if any(isinstance(item, dict | list) for item in level):
+            depth += 1
         if depth > _spec.JSON_DEPTH_MAX:
             raise _RefusedError(f"nested more than {_spec.JSON_DEPTH_MAX} deep")
         level = nested

@@ -248,6 +248,7 @@ def _bound(block: Block, record: _spec.AttributeRecord) -> int:
 
 
 def _is_finite(integer: int, step: float) -> bool:
+    """Return True if the product of an integer and a positive step, rounded once to float32, is finite."""
     return bool(np.isfinite(np.float32(min(integer * step, math.inf))))
 
 

@@ -327,7 +327,11 @@ def _check_sums(block: CodebookBlock, context: TileContext) -> None:
 
 
 def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tuple[int, int]:
-    """Step over the rest of a CODEBOOK block after its head; return the offset of its codebook id, and the id."""
+    """Step over the rest of a CODEBOOK block after its head; return the offset of its codebook id, and the id.
+
+    Raises:
+        FormatError: E_CODEBOOK for an unknown codebook (CBK-1), or the payload ends within the block.
+    """
     at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
     params = _spec.unpack_codebook_params(cursor.view, at)
     book = next((record for record in header.codebooks if record.codebook_id == params.codebook_id), None)
@@ -352,5 +356,6 @@ def _step_over(cursor: Cursor, attribute: int, coding: int) -> None:
 
 
 def _step_over_stream(cursor: Cursor) -> None:
+    """Advance the cursor over a stream: its head and its coded bytes."""
     at = cursor.take(_spec.STREAM_HEAD_SIZE)
     cursor.take(_spec.unpack_stream_head(cursor.view, at).coded_size)

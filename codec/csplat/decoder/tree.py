@@ -58,7 +58,7 @@ def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
         raise FormatError(_spec.ERROR_STREAM, at, "TRE-2", "the payload of TREE", found=f"{size} bytes", wanted=wanted)
     offsets = range(start, cursor.end, _spec.NODE_RECORD_SIZE)
     records: list[_spec.NodeRecord] = []
-    tiles = _share_tiles(view, offsets, start, header.all_tiles, records)
+    tiles = _read_node_records(view, offsets, start, header.all_tiles, records)
     children = _find_children(records, tiles, offsets)
     nodes = tuple(
         Node(
@@ -76,33 +76,33 @@ def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
     return nodes
 
 
-def _share_tiles(
+def _read_node_records(
     view: memoryview, offsets: range, start: int, tiles: tuple[Tile, ...], records: list[_spec.NodeRecord]
 ) -> list[tuple[Tile, ...]]:
-    """Read the records and return the tiles of each node (TRE-3, TRE-4)."""
+    """Append the records at `offsets` to `records`, and return the tiles of each node; check TRE-3 and TRE-4."""
     count_at = _spec.NODE_RECORD_OFFSETS["tile_count"]
-    result: list[tuple[Tile, ...]] = []
+    tiles_of_nodes: list[tuple[Tile, ...]] = []
     first = 0
     for at in offsets:
         record = _spec.unpack_node_record(view, at)
-        left = len(tiles) - first
-        if not 1 <= record.tile_count <= left:
-            wanted = f"1 to {left}, the tiles that are left"
+        remaining = len(tiles) - first
+        if not 1 <= record.tile_count <= remaining:
+            wanted = f"1 to {remaining}, the tiles that are left"
             raise FormatError(
                 _spec.ERROR_INDEX, at + count_at, "TRE-3", "tile_count", found=record.tile_count, wanted=wanted
             )
-        own = tiles[first : first + record.tile_count]
-        if own[0].level != own[-1].level:  # TIL-12: the levels of tiles do not descend
-            detail = f"a node has tiles of the levels {own[0].level} and {own[-1].level}"
+        node_tiles = tiles[first : first + record.tile_count]
+        if node_tiles[0].level != node_tiles[-1].level:  # TIL-12: the levels of tiles do not descend
+            detail = f"a node has tiles of the levels {node_tiles[0].level} and {node_tiles[-1].level}"
             raise FormatError(_spec.ERROR_INDEX, at + count_at, "TRE-4", detail)
         records.append(record)
-        result.append(own)
+        tiles_of_nodes.append(node_tiles)
         first += record.tile_count
     if first != len(tiles):
         raise FormatError(
             _spec.ERROR_INDEX, start, "TRE-3", "tiles of all nodes together", found=first, wanted=len(tiles)
         )
-    return result
+    return tiles_of_nodes
 
 
 def _find_children(
@@ -110,19 +110,19 @@ def _find_children(
 ) -> list[list[int]]:
     """Check TRE-5 and return the children of each node."""
     children: list[list[int]] = [[] for _ in records]
-    for number, (record, own) in enumerate(zip(records, tiles, strict=True)):
+    for number, (record, node_tiles) in enumerate(zip(records, tiles, strict=True)):
         if record.parent == _spec.NO_PARENT:
             continue
-        if record.parent >= len(records) or tiles[record.parent][0].level <= own[0].level:
+        if record.parent >= len(records) or tiles[record.parent][0].level <= node_tiles[0].level:
             at = offsets[number] + _spec.NODE_RECORD_OFFSETS["parent"]
-            wanted = f"a node of a level above {own[0].level}"
+            wanted = f"a node of a level above {node_tiles[0].level}"
             raise FormatError(_spec.ERROR_INDEX, at, "TRE-5", "parent", found=record.parent, wanted=wanted)
         children[record.parent].append(number)
     return children
 
 
 def _check_node(nodes: Sequence[Node], node: Node, at: int) -> None:
-    """Check TRE-6 to TRE-8 for a node whose record is at an offset."""
+    """Check TRE-6 to TRE-8 for a node whose record is at an offset; its children are in `nodes`."""
     error_at = at + _spec.NODE_RECORD_OFFSETS["error"]
     if node.level == 0:
         if node.error != 0.0:
@@ -165,17 +165,17 @@ def select_tiles(
         InputError: several of the three are given, or a value is out of its range.
         LimitError: the coarsest cut has more than `max_splats` splats.
     """
-    given = [
+    criteria = [
         name
         for name, value in (("level", level), ("pixel_size", pixel_size), ("max_splats", max_splats))
         if value is not None
     ]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} exclude each other")
+    if len(criteria) > 1:
+        raise InputError(f"{' and '.join(criteria)} exclude each other")
     if pixel_size is not None:
         cut = _at_pixel_size(nodes, pixel_size)
     elif max_splats is not None:
-        cut = _within(nodes, max_splats)
+        cut = _cut_within_budget(nodes, max_splats)
     else:
         most = 0 if level is None else level
         if not 0 <= most <= 255:
@@ -235,8 +235,16 @@ def _at_pixel_size(nodes: Sequence[Node], pixel_size: float | Sequence[float]) -
     return _cut_where(nodes, lambda number: nodes[number].error > sizes[number])
 
 
-def _within(nodes: Sequence[Node], max_splats: int) -> list[int]:
-    """Replace the node with the largest error until the budget would be exceeded; the last node wins a tie."""
+def _cut_within_budget(nodes: Sequence[Node], max_splats: int) -> list[int]:
+    """Return a cut of at most `max_splats` splats, ascending.
+
+    From the roots on, the node with the largest error is replaced by its children, until that would exceed the number.
+    The last node wins a tie.
+
+    Raises:
+        InputError: `max_splats` is negative.
+        LimitError: the roots have more splats.
+    """
     if max_splats < 0:
         raise InputError(f"max_splats is {max_splats}, expected 0 or more")
     cut = {number for number, node in enumerate(nodes) if node.parent is None}

@@ -124,7 +124,8 @@ def merge(
             _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
         windows = [scene.window() for scene in scenes]
         fields = [scene_fields(window, scene.header, (), ()) for window, scene in zip(windows, scenes, strict=True)]
-        why, ids = _difference(fields, names), []
+        why = _describe_difference(fields, names)
+        ids = []
         spool = PayloadSpool(stack.enter_context(temporary_file()))
         books = MergedCodebooks(spool)
         if not why:
@@ -134,7 +135,7 @@ def merge(
         if why:
             why += "; levels of detail are left out" * any(scene.header.coarse_tiles for scene in scenes)
             result = _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
-            return replace(result, notes=_notes(scenes, names))
+            return replace(result, notes=_list_assumptions(scenes, names))
         nodes: list[FileNode] = []
         for window, scene, new in zip(windows, scenes, ids, strict=True):
             copied = renumber_tiles(window, scene.header, new, spool, len(scenes))
@@ -151,7 +152,7 @@ def merge(
             codebooks=books.records,
             chunks=[*tree, *_common_chunks(scenes), *books.chunks],
         )
-        return replace(_write_merged(together, tiles, output), notes=_notes(scenes, names))
+        return replace(_write_merged(together, tiles, output), notes=_list_assumptions(scenes, names))
 
 
 def _refuse_other_axes(scenes: Sequence[SplatFile], names: Sequence[str]) -> None:
@@ -167,17 +168,18 @@ def _refuse_other_axes(scenes: Sequence[SplatFile], names: Sequence[str]) -> Non
     for up, name in directions[1:]:
         first, first_name = directions[0]
         if float(up @ first) < CONTRADICTS:
-            both = f"{_numbers(first)} in {first_name}, {_numbers(up)} in {name}"
+            both = f"{_format_vector(first)} in {first_name}, {_format_vector(up)} in {name}"
             raise InputError(
                 f"scenes with different up directions cannot be merged: {both}: set one with csplat convert --up"
             )
 
 
-def _numbers(values: NDArray[Any]) -> str:
+def _format_vector(values: NDArray[Any]) -> str:
+    """Format a vector for messages, with commas and without spaces."""
     return ",".join(f"{value:g}" for value in values)
 
 
-def _notes(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]:
+def _list_assumptions(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]:
     """Describe what is assumed of files that leave axes or unit open, and metadata that not all files share."""
     headers = [scene.header for scene in scenes]
     notes = []
@@ -209,7 +211,7 @@ def _refuse_contradiction(
     """
     known = [
         (value, f"{text} in {name}")
-        for value, text, name in zip(values, texts or map(_text, values), names, strict=True)
+        for value, text, name in zip(values, texts or map(_format_value, values), names, strict=True)
         if value is not None
     ]
     for value, text in known[1:]:
@@ -218,12 +220,13 @@ def _refuse_contradiction(
             raise InputError(f"scenes with different {words} cannot be merged: {known[0][1]}, {text}{advice}")
 
 
-def _text(value: Any) -> str:
+def _format_value(value: Any) -> str:
+    """Format a value for messages; booleans as yes and no."""
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
-def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
-    """Return the reason why tiles of the first file are not valid in another; "" if they are."""
+def _describe_difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
+    """Return the first difference in header fields that keeps tiles from being copied together; "" if there is none."""
     first, first_name = fields[0], names[0]
     for other, name in zip(fields[1:], names[1:], strict=True):
         if other.sh_degree != first.sh_degree:
@@ -249,11 +252,13 @@ def _common_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
 
 
 def _common_cameras(scenes: Sequence[SplatFile]) -> Sequence[Mapping[str, Any]] | None:
+    """Return the cameras, `None` included, that all files share; `None` if the files differ."""
     first, *others = (scene.metadata.cameras for scene in scenes)
     return first if all(cameras == first for cameras in others) else None
 
 
 def _common_entries(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the metadata entries that all mappings contain with the same value."""
     first, *others = values
     return {
         key: value
@@ -265,6 +270,7 @@ def _common_entries(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _write_merged(
     scene: SceneFields, tiles: Sequence[FileTile], output: str | os.PathLike[str] | BinaryWriter
 ) -> MergeResult:
+    """Write a file of copied tiles; the result counts the splats of level 0."""
     size = 0
     with open_writer(output) as stream:
         for part in file_pieces(scene, tiles):
@@ -277,7 +283,7 @@ def _encode_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
 ) -> MergeResult:
     """Decode the scenes tile by tile and encode them together, in memory if they fit."""
-    whole = _merged_scene(scenes)
+    whole = _merge_scenes(scenes)
     dropped = {column.name for scene in scenes for column in scene.header.extras} - whole.extra.keys()
     with temporary_folder() as folder:
         path = folder / "merged.csplat"
@@ -287,7 +293,7 @@ def _encode_again(
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 
 
-def _merged_scene(scenes: Sequence[SplatFile]) -> Scene:
+def _merge_scenes(scenes: Sequence[SplatFile]) -> Scene:
     """Return all splats with a common origin, and the extra columns that all files have."""
     headers = [scene.header for scene in scenes]
     origins = np.array([header.origin for header in headers])
@@ -296,7 +302,7 @@ def _merged_scene(scenes: Sequence[SplatFile]) -> Scene:
     whole = Scene(
         sum(map(len, scenes)),
         max(header.sh_degree for header in headers),
-        lambda: _blocks(scenes, whole.empty()),
+        lambda: _merged_blocks(scenes, whole.empty()),
         origin=(x, y, z),
         has_doubles=bool((origins != origins[0]).any()),
         metadata=SceneMetadata(
@@ -316,7 +322,11 @@ def _merged_scene(scenes: Sequence[SplatFile]) -> Scene:
     return whole
 
 
-def _blocks(scenes: Sequence[SplatFile], empty: SplatModel) -> Iterator[SplatModel]:
+def _merged_blocks(scenes: Sequence[SplatFile], empty: SplatModel) -> Iterator[SplatModel]:
+    """Yield the tiles of all files as models like `empty`.
+
+    Means are relative to the common origin, missing SH bands are 0, and extra columns are those of `empty`.
+    """
     for scene in scenes:
         for tile in scene.tiles():
             shN = np.zeros((len(tile.means), *empty.shN.shape[1:]), np.float32)
@@ -353,6 +363,7 @@ class PayloadSpool:
         return LazyPayload(len(payload), chunk_crc(kind, payload), partial(self._read, start, len(payload)))
 
     def _read(self, start: int, size: int) -> bytes:
+        """Return the payload of `size` bytes that begins at `start` in the temporary file."""
         self._stream.seek(start)
         return self._stream.read(size)
 
@@ -426,7 +437,7 @@ def renumber_tiles(
         (tile, tile.layers[layer])
         for layer in range(_spec.SH_DEGREE_MAX + 1)
         for tile in header.all_tiles
-        if layer in _naming_layers(header, tile, ids) & tile.layers.keys()
+        if layer in _layers_with_changed_ids(header, tile, ids) & tile.layers.keys()
     ]
     turn = ChunkPrefetcher(window, [record for _, record in naming], files)
     for index, (tile, record) in enumerate(naming):
@@ -441,7 +452,7 @@ def renumber_tiles(
     ]
 
 
-def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
+def _layers_with_changed_ids(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
     """Return the layers of a tile that may reference a codebook whose id changes."""
     moved = {identity for identity in tile.codebook_ids if ids[identity] != identity}
     return {
@@ -455,17 +466,18 @@ def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> s
 def _rewrite_ids(
     window: FileWindow, header: SceneHeader, record: _spec.LayerRecord, ids: Mapping[int, int], spool: PayloadSpool
 ) -> LazyPayload | None:
-    """Replace the ids in a chunk and store it; return `None` if it references no codebook."""
+    """Replace the codebook ids in a layer chunk by `ids[id]`, and store it in `spool`; `None` if it has none."""
     with window.store.named_errors():
         references = list(codebook_references(window.view, header, record))
     if not references:
         return None
     payload = bytearray(chunk_payload(window, record))
     begin = record.offset + _spec.CHUNK_HEADER_SIZE
-    for at, id in references:
+    for at, id in references:  # offsets in the file
         payload[at - begin : at - begin + _ID_SIZE] = _as_bytes(ids[id])
     return spool.put(_spec.CHUNK_TILE, bytes(payload))
 
 
 def _as_bytes(id: int) -> bytes:
+    """Encode a codebook id as the file stores it."""
     return id.to_bytes(_ID_SIZE, "little")

@@ -27,6 +27,7 @@ _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
 #: Axes assumed for a scene that does not specify any; COLMAP and OpenCV use them.
 DEFAULT_AXES = "RDF"
 _ORTHOGONAL = 1e-6  # tolerance for the entries of M Mᵀ - 1
+_HALF_TURN = 1e-12  # the cosine of half a turn is -1 within this; other rotations divide by 1 + cosine
 _WHOLE = 1e-9  # entries of a computed rotation within this distance of an integer are rounded
 _DIRECTIONS = 40  # number of directions in which rotated SH bands are fitted
 _EVEN = 1e-6  # relative difference up to which a stretch counts as uniform: files store it in float32
@@ -155,7 +156,7 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
     x, y, z = (stretch @ model.origin).tolist()
     doubles = None if model.means_double is None else _multiply_rows(stretch, model.means_double)
     with np.errstate(over="ignore"):
-        root = stretch @ _matrices(model.quats) * np.exp(model.scales.astype(np.float64))[:, None]
+        root = stretch @ _rotation_matrices(model.quats) * np.exp(model.scales.astype(np.float64))[:, None]
         turns, axes, _ = np.linalg.svd(root)
         turns[:, :, 2] *= np.linalg.det(turns)[:, None]
         return replace(
@@ -179,19 +180,27 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
 
 
 def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
+    """Return the matrix, [3, 3], that takes a scene to the target axes.
+
+    For a scene without axes, the default axes are assumed. If its up direction is known, the result is tilted so that
+    it becomes the up direction of the target axes.
+    """
     known = metadata.coordinate_system != UNSPECIFIED
     matrix = axes_rotation(metadata.coordinate_system if known else DEFAULT_AXES, axes)
     up, target_up = metadata.stated_up, up_of_axes(axes)
     if known or up is None or target_up is None:
         return matrix
-    tilted: F64 = _tilt(_multiply_rows(matrix, np.array(up, np.float64)), np.array(target_up)) @ matrix
+    tilted: F64 = _smallest_rotation(_multiply_rows(matrix, np.array(up, np.float64)), np.array(target_up)) @ matrix
     return tilted
 
 
-def _tilt(start: F64, end: F64) -> F64:
-    """Return the smallest rotation, [3, 3], that takes a unit vector [3] to another."""
+def _smallest_rotation(start: F64, end: F64) -> F64:
+    """Return the smallest rotation, [3, 3], that takes the unit vector `start` [3] to `end`.
+
+    For opposite vectors, the axis is perpendicular to `start` and near the coordinate axis of its smallest component.
+    """
     axis, cosine = np.cross(start, end), float(start @ end)
-    if cosine < -1.0 + 1e-12:  # half a turn about any perpendicular axis
+    if cosine < -1.0 + _HALF_TURN:  # half a turn about any perpendicular axis
         axis = np.eye(3)[int(np.abs(start).argmin())]
         axis -= start * (axis @ start)
         return _round_near_integers(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
@@ -206,8 +215,8 @@ def _multiply_rows(matrix: F64, rows: _Rows) -> _Rows:
     signs: F64 = matrix[np.arange(len(matrix)), order]
     out = np.empty_like(rows)
     if (np.abs(signs) == 1.0).all() and np.count_nonzero(matrix) == len(matrix):
-        picked = rows if (order == np.arange(len(order))).all() else rows[..., order]
-        np.multiply(picked, signs.astype(rows.dtype), out=out)
+        permuted = rows if (order == np.arange(len(order))).all() else rows[..., order]
+        np.multiply(permuted, signs.astype(rows.dtype), out=out)
         return out
     with np.errstate(over="ignore"):  # `SplatModel` refuses infinite values
         for start in range(0, len(rows), _ROWS):
@@ -217,7 +226,10 @@ def _multiply_rows(matrix: F64, rows: _Rows) -> _Rows:
 
 
 def _rotate_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
-    """Return quats [N, 4] and scales [N, 3]; a permutation of axes permutes the scales, which is exact."""
+    """Return the quats [N, 4] and scales [N, 3] of a model rotated by an orthogonal matrix [3, 3].
+
+    A permutation of axes permutes the scales and is exact, unless it moves the third axis of a model of discs.
+    """
     proper = matrix * np.sign(np.linalg.det(matrix))
     order = np.abs(matrix).argmax(axis=1)
     whole = np.count_nonzero(matrix) == 3
@@ -240,7 +252,7 @@ def _quats_of(matrix: F64) -> F64:
     return np.where(quats[..., :1] < 0.0, -quats, quats)  # the signs of eigenvectors differ between machines
 
 
-def _matrices(quats: F32) -> F64:
+def _rotation_matrices(quats: F32) -> F64:
     """Return the rotation matrices [N, 3, 3] of quaternions [N, 4]."""
     w, x, y, z = normalise_quats(quats).astype(np.float64).T
     rows = [
@@ -282,6 +294,7 @@ def sh_rotations(degree: int, matrix: F64) -> list[F64]:
 
 
 def _round_near_integers(matrix: NDArray[Any]) -> F64:
+    """Replace elements within `_WHOLE` of an integer by that integer, so that permutations are exact."""
     whole = np.rint(matrix)
     snapped: F64 = np.where(np.abs(matrix - whole) < _WHOLE, whole, matrix)
     return snapped
@@ -309,7 +322,7 @@ def rotate_metadata(metadata: SceneMetadata, matrix: F64) -> SceneMetadata:
 
 
 def _with_cameras(metadata: SceneMetadata, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> SceneMetadata:
-    """Return metadata with changed cameras; a view that is not a valid camera stays unchanged."""
+    """Return metadata with `change` applied to the cameras and the view; a view that is not a valid camera is kept."""
     if metadata.cameras:
         metadata = replace(metadata, cameras=[change(camera) for camera in metadata.cameras])
     if VIEW in metadata.entries:
@@ -319,6 +332,7 @@ def _with_cameras(metadata: SceneMetadata, change: Callable[[Mapping[str, Any]],
 
 
 def _rotate_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
+    """Return a camera that sees a scene rotated by a matrix [3, 3] as before, horizontally flipped if that mirrors."""
     view, K = np.array(camera["viewmat"], np.float64), np.array(camera["K"], np.float64)
     view[:3, :3] = view[:3, :3] @ matrix.T
     if np.linalg.det(matrix) < 0.0:  # mirror the image horizontally, so that the view stays a rotation
@@ -328,12 +342,14 @@ def _rotate_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
 
 
 def _translate_camera(camera: Mapping[str, Any], step: F64) -> dict[str, Any]:
+    """Return a camera that sees a scene translated by a step [3], scene units, as it saw the scene before."""
     view = np.array(camera["viewmat"], np.float64)
     view[:3, 3] -= view[:3, :3] @ step
     return {**camera, "viewmat": view.tolist()}
 
 
 def _scale_camera(camera: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    """Return a camera of the scene with all lengths multiplied by a factor; its near plane is scaled, too."""
     view = np.array(camera["viewmat"], np.float64)
     view[:3, 3] *= factor
     near = {"near": camera["near"] * factor} if "near" in camera else {}

@@ -135,9 +135,9 @@ class BucketCurve:
     def _codes(self, means: F32) -> I64:
         """Return the Morton codes of means [n, 3], int64 [n]; positions outside the curve are clipped to it."""
         codes = np.empty(len(means), np.int64)
-        for at in range(0, len(means), _CURVE_BLOCK):
-            cells = (means[at : at + _CURVE_BLOCK].T.astype(np.float64) - self.corner[:, None]) * self.scale
-            codes[at : at + _CURVE_BLOCK] = morton_codes(np.clip(cells, 0, _CURVE_TOP).astype(np.int32))
+        for start in range(0, len(means), _CURVE_BLOCK):
+            cells = (means[start : start + _CURVE_BLOCK].T.astype(np.float64) - self.corner[:, None]) * self.scale
+            codes[start : start + _CURVE_BLOCK] = morton_codes(np.clip(cells, 0, _CURVE_TOP).astype(np.int32))
         return codes
 
 

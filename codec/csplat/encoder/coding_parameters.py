@@ -36,6 +36,11 @@ _RUNS = 16  # runs of neighbours in the sample
 _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
 _COLOUR_DIFFERENCE_MAX = 10.0  # sh0; a larger difference is an outlier, and counts as this
 _CORE = 0.8  # fraction of the splats within the scene's reach
+_STEP_SHARE_MIN = 2.0**-40  # smallest step of the means, as a fraction of the reach of the scene's core
+_LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its exponential stays within float32
+_CONTRAST_DEFAULT = 0.2  # contrast of a scene without pairs of neighbours
+_LEVELS_RANGE = (8, 255)  # opacity and rotation levels that the quality may choose
+_SCALE_STEP_MAX = 0.5  # log scale; largest step that the quality may choose
 _CODE_BITS = 16  # bits per axis of a Morton code
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
 
@@ -222,19 +227,19 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
         contrast: contrast of the scene, if the model is a sample, which has no neighbours; see `measure_contrast`.
     """
     if len(model) == 0:
-        return SceneStatistics(0.0, 0.2, 0.01)
+        return SceneStatistics(reach=0.0, contrast=_CONTRAST_DEFAULT, size=0.01)
     points, reach = _reach(model.means)
     largest = np.take(model.scales, _sample_rows(len(model)), axis=0).max(axis=1)
-    size = float(exp(float(np.clip(np.median(largest), -80, 80)))) / reach if reach else 1.0
+    size = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX)))) / reach if reach else 1.0
     if contrast is None:
-        contrast = _rms(*_contrast_sums(model, points, reach))
+        contrast = _contrast(*_contrast_sums(model, points, reach))
     return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
 
 
 def measure_contrast(parts: Iterable[SplatModel]) -> float:
     """Return the contrast of a scene from parts of it, each with all splats of its region."""
     sums = [_contrast_sums(part, *_reach(part.means)) for part in parts if len(part)]
-    return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
+    return _contrast(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
 
 
 @dataclass(frozen=True)
@@ -255,31 +260,45 @@ def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, ha
     The factors are medians over ten scenes of the step that leaves 50 dB, divided by the statistics; they scatter by a
     quarter to a third (2 to 3 dB). The rate is lowest if every dimension has the same error. The differences between
     attributes were determined by search, with and without SH.
+
+    Args:
+        statistics: statistics of the scene.
+        quality: PSNR for each attribute except the SH bands from 1 on, before the differences above, dB.
+        sh_quality: PSNR for these bands, dB.
+        has_sh: the file has these bands.
     """
     contrast = statistics.contrast
     for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
 
     def coarse(decibels: float) -> float:
+        """Return the factor from a step that leaves 50 dB to one that leaves `decibels`."""
         return float(exp(log(10.0) * (50.0 - decibels) / 20.0))
 
     opacities = contrast / (0.012 * coarse(quality + for_quats))
     quats = contrast * math.sqrt(statistics.size * math.sqrt(statistics.size)) * 2090.0 / coarse(quality + for_quats)
     return _AttributeSteps(
         means=2.2e-4 * coarse(quality) * statistics.reach / contrast,
-        scales=min(0.5, 0.04 * coarse(quality) / contrast),
-        opacity_levels=int(np.clip(np.ceil(opacities), 8, 255)),
-        quat_levels=int(np.clip(np.ceil(quats), 8, 255)),
+        scales=min(_SCALE_STEP_MAX, 0.04 * coarse(quality) / contrast),
+        opacity_levels=int(np.clip(np.ceil(opacities), *_LEVELS_RANGE)),
+        quat_levels=int(np.clip(np.ceil(quats), *_LEVELS_RANGE)),
         sh0=0.07 * coarse(quality + for_sh0),
         sh=0.0135 * coarse(sh_quality),
     )
 
 
-def _default_to(chosen: Any, otherwise: Any) -> Any:
-    return otherwise if chosen is None else chosen
+def _default_to(option: Any, default: Any) -> Any:
+    """Return an option, which may be 0, or the default if the caller left it `None`."""
+    return default if option is None else option
 
 
 def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> Lattice:
-    """Choose the lattice of the means by an option (error, step, or bits over the scene's core) or by the quality."""
+    """Choose the lattice of the means by the first option that is set, or by the quality.
+
+    Args:
+        model: the scene.
+        options: `position_error`, `position_step`, and `position_bits`, which divide the extent of the scene's core.
+        by_quality: step that the quality chooses, scene units; 0 if the scene has no extent.
+    """
     if options.position_error is not None:
         return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, error=options.position_error)
     if options.position_step is not None:
@@ -299,8 +318,8 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> La
 
 
 def _clamp_step(step: float, reach: float) -> float:
-    """Limit the step to normal numbers, and to the precision of float32 at the border of the scene's core."""
-    step = max(step, reach * 2.0**-40)
+    """Raise a step to `_STEP_SHARE_MIN` of the reach; return 1 if it is then not finite or at most `_STEP_MIN`."""
+    step = max(step, reach * _STEP_SHARE_MIN)
     return step if np.isfinite(step) and step > _STEP_MIN else 1.0
 
 
@@ -320,24 +339,33 @@ def _source_step(values: F32, step: float) -> float:
 
 
 def _on_grid(values: F32, grid: float) -> bool:
+    """Return True if every value is a multiple of `grid`; an infinite value is on no grid."""
     with np.errstate(over="ignore", invalid="ignore"):
         return not np.fmod(values, np.float32(grid)).any()
 
 
 def _sample_rows(count: int) -> NDArray[np.intp]:
+    """Return evenly spaced rows: all below twice `_STATISTICS_SAMPLE`, otherwise 1 to 1.5 times as many as this."""
     return np.arange(0, count, max(1, count // _STATISTICS_SAMPLE))
 
 
 def _reach(means: F32) -> tuple[F64, float]:
-    """Return a sample [n, 3] of the means, and the radius around their median that contains 80 % of it."""
+    """Return a sample [n, 3] of the means [N, 3], N > 0, and the radius around its median that contains `_CORE` of it.
+
+    The radius is in scene units, 0 if all means of the sample are equal.
+    """
     points = np.take(means, _sample_rows(len(means)), axis=0).astype(np.float64)
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())
-    return points, top and top * float(np.quantile(np.sqrt(np.square(distance / top).sum(axis=1)), _CORE))
+    if top == 0.0:
+        return points, 0.0
+    relative = np.sqrt(np.square(distance / top).sum(axis=1))  # squares of relative distances do not overflow
+    return points, top * float(np.quantile(relative, _CORE))
 
 
-def _rms(squares: float, weights: float) -> float:
-    return SH_C0 * float(np.sqrt(squares / weights)) if weights else 0.2
+def _contrast(squares: float, weights: float) -> float:
+    """Return the rms colour difference, SH_C0 √(Σ w d² / Σ w), of these sums; `_CONTRAST_DEFAULT` if Σ w is 0."""
+    return SH_C0 * float(np.sqrt(squares / weights)) if weights else _CONTRAST_DEFAULT
 
 
 def _contrast_sums(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
@@ -365,15 +393,24 @@ def _contrast_sums(model: SplatModel, sample: F64, reach: float) -> tuple[float,
     return squares, weights
 
 
-def _neighbour_runs(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
-    """Return runs of rows of means [N, 3] in Morton order: all of a small scene, some of a large scene."""
+def _neighbour_runs(means: F32, centre: NDArray[Any], side: float) -> list[NDArray[np.intp]]:
+    """Return runs of rows in Morton order: one run of all splats of a small scene, up to `_RUNS` of a large scene.
+
+    Runs of a large scene have about `_STATISTICS_SAMPLE` splats together; those with too few for a pair are omitted.
+
+    Args:
+        means: [N, 3].
+        centre: [3], middle of the grid of Morton codes.
+        side: side of the grid, scene units, > 0; means outside are moved to its border.
+    """
     codes = np.empty(len(means), np.int64)
-    scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1
-    shift = np.float32(0.5) - (centre / reach).astype(np.float32)
-    for at in range(0, len(means), _STATISTICS_SAMPLE):
-        with np.errstate(over="ignore"):  # infinity is clipped to the reach
-            positions = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
-        codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(positions, 0, 1) * top).astype(np.int32))
+    scale = np.float32(min(1.0 / side, _CELLS_MAX))
+    top = (1 << _CODE_BITS) - 1  # last cell of an axis
+    shift = np.float32(0.5) - (centre / side).astype(np.float32)
+    for start in range(0, len(means), _STATISTICS_SAMPLE):
+        with np.errstate(over="ignore"):  # infinity is clipped to the grid
+            positions = means[start : start + _STATISTICS_SAMPLE].T * scale + shift[:, None]
+        codes[start : start + _STATISTICS_SAMPLE] = morton_codes((np.clip(positions, 0, 1) * top).astype(np.int32))
     if len(means) <= 2 * _STATISTICS_SAMPLE:
         return [np.argsort(codes, kind="stable")]
     bounds = np.sort(codes[:: len(codes) // _STATISTICS_SAMPLE])

@@ -193,17 +193,23 @@ def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes
 
 
 def _flags(kind: bytes) -> int:
+    """Return the flags that the specification gives a type of chunk."""
     return sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[kind])
 
 
 def _chunk_head(kind: bytes, size: int) -> bytes:
+    """Return the header of a chunk, by its type and the size of its payload in bytes."""
     return _spec.pack_chunk_header(_spec.ChunkHeader(kind, _flags(kind), 0, size))
 
 
 def _ordered_chunks(
     scene: SceneFields, tiles: Sequence[FileTile]
 ) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
-    """Yield each chunk with its (tile, layer); `None` for chunks other than tiles."""
+    """Yield each chunk in the order of the file, with its (tile, layer), or `None` for chunks other than tiles.
+
+    First the nodes and the scene's other chunks, then layer by layer its codebooks and its tiles, coarsest level first.
+    If there are nodes, the chunks of `_LAST` are at the end.
+    """
     tree = [chunk for chunk in scene.chunks if chunk.type == _spec.CHUNK_TREE]
     others = [chunk for chunk in scene.chunks if chunk.type not in (_spec.CHUNK_CODEBOOK, _spec.CHUNK_TREE)]
     last = [chunk for chunk in others if tree and chunk.type in _LAST]

@@ -236,11 +236,21 @@ class EncodePlan:
         return replace(self, parameters=parameters), codebooks
 
     def _assign_all(self, parameters: CodingParameters, codebooks: FileCodebooks) -> ShCodingPlan:
-        """Assign all splats to the codebooks of the sample."""
+        """Assign all splats to the codebooks of the sample, bucket by bucket.
+
+        Args:
+            parameters: the final parameters.
+            codebooks: codebooks of the sample, whose plan has the assignment of the sample.
+
+        Returns:
+            The plan with weights and assignment of all splats; the same plan if it has neither.
+        """
         sh_plan, count = codebooks.sh_plan, len(self.model)
+        if sh_plan.book is None and sh_plan.weights is None:
+            return sh_plan
         index = None if sh_plan.book is None else np.empty(count, np.int32)
         weights = None if sh_plan.weights is None else np.empty(count, np.float32)
-        for rows in self.buckets if index is not None or weights is not None else ():
+        for rows in self.buckets:
             part = assign_splats(codebooks, self.model.select(rows), parameters, self.context)
             if weights is not None and part.weights is not None:
                 weights[rows] = part.weights

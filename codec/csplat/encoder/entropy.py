@@ -19,9 +19,11 @@ from csplat.types import I64
 Integers = NDArray[Any]
 
 _FASTEST_LEVEL = 1  # DEFLATE level at which samples replace trials
+_RUN_BYTES_MIN = 64  # bytes from which RUN_LENGTH is tried
+_DEFLATE_BYTES_MIN = 4  # DEFLATE cannot shorten fewer bytes
 _SHORT_RUN = 1.5  # mean run length, bytes, from which RUN_LENGTH is tried
 _LONG_RUN = 32  # the same at the fastest level
-_SAMPLE = 4096  # bytes of each of four samples
+_SAMPLE = 4096  # bytes of each of four evenly spaced samples, to which up to 3 bytes at the end may be added
 _TRIAL_LEVEL = 6  # DEFLATE level of trials, which takes a twentieth of the highest level's time and rarely errs
 _CLEAR = 0.95  # ratio of the sizes of trials from which the smaller remains the smaller at the highest level
 _GAIN = 0.98  # maximum relative size with RUN_LENGTH; a smaller gain is not worth the decoding time
@@ -116,9 +118,14 @@ def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
         differences = np.diff(low)  # modulo 256; zigzag would not change the entropy
         return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
     trial = trial_settings(deflate)
-    sizes = [len(unsigned_stream(values, trial, signed_delta=delta)) for delta in (False, True)]
-    tried = [delta for delta in (False, True) if _CLEAR * sizes[delta] <= sizes[not delta]]
-    return min((unsigned_stream(values, deflate, signed_delta=delta) for delta in tried), key=len)
+    plain_size = len(unsigned_stream(values, trial))
+    delta_size = len(unsigned_stream(values, trial, signed_delta=True))
+    streams = list[bytes]()  # both, unless one is clearly larger
+    if _CLEAR * plain_size <= delta_size:
+        streams.append(unsigned_stream(values, deflate))
+    if _CLEAR * delta_size <= plain_size:
+        streams.append(unsigned_stream(values, deflate, signed_delta=True))
+    return min(streams, key=len)
 
 
 def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
@@ -158,11 +165,11 @@ def signed_block(attribute: int, integers: Integers, exponent: int, deflate: Def
 
 def sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
     """Return a SPARSE block of integers [C, n] of at most 32 bits, not all 0."""
-    has = integers.any(axis=0)
-    params = _spec.SparseParams(exponent, 0, int(np.count_nonzero(has)))
-    mask = unsigned_stream(np.packbits(has, bitorder="little"), deflate, fixed_width=1)
+    coded = integers.any(axis=0)  # splats with an integer other than 0
+    params = _spec.SparseParams(exponent, 0, int(np.count_nonzero(coded)))
+    mask = unsigned_stream(np.packbits(coded, bitorder="little"), deflate, fixed_width=1)
     head = _block_head(attribute, _spec.CODING_SPARSE) + _spec.pack_sparse_params(params)
-    return head + mask + signed_stream(np.ascontiguousarray(integers[:, has]).reshape(-1), deflate)
+    return head + mask + signed_stream(np.ascontiguousarray(integers[:, coded]).reshape(-1), deflate)
 
 
 def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
@@ -232,6 +239,7 @@ def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _block_head(attribute: int, coding: int) -> bytes:
+    """Return the head of a block, by the ids of its attribute and coding."""
     return _spec.pack_block_head(_spec.BlockHead(attribute, coding, 0))
 
 
@@ -244,15 +252,25 @@ def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -
 
 
 def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
-    """Apply BYTE_PLANES and RUN_LENGTH to values [N], choose the coder, and return head and coded bytes."""
+    """Write a stream: apply BYTE_PLANES, and RUN_LENGTH if it pays, and choose the coder.
+
+    Args:
+        values: [n], n >= 1, elements after `transforms`.
+        width: bytes per element.
+        transforms: transforms that the caller has applied, in their order.
+        deflate: level and library of DEFLATE.
+
+    Returns:
+        Head and coded bytes.
+    """
     steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
     if width > 1:
         steps.append(_spec.TRANSFORM_BYTE_PLANES)
     planes = _byte_planes(values, width)
-    runs = _run_length(planes, _LONG_RUN if deflate.level <= _FASTEST_LEVEL else _SHORT_RUN)
+    run_length = _run_length(planes, _LONG_RUN if deflate.level <= _FASTEST_LEVEL else _SHORT_RUN)
     packed = planes
-    if runs is not None and _is_smaller(runs, planes, deflate):
-        packed = runs
+    if run_length is not None and _run_length_pays(run_length, planes, deflate):
+        packed = run_length
         steps.append(_spec.TRANSFORM_RUN_LENGTH)
     coder, coded = _code(packed, deflate)
     head = _spec.StreamHead(
@@ -268,6 +286,7 @@ def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], defl
 
 
 def _width(largest: int) -> int:
+    """Return the bytes, at least 1, of an unsigned integer."""
     return max(1, (largest.bit_length() + 7) // 8)
 
 
@@ -280,6 +299,7 @@ def _zigzag(values: Integers) -> Integers:
 
 
 def _byte_entropy(symbols: NDArray[np.uint8]) -> float:
+    """Return the order-0 entropy of bytes [n], bits per byte."""
     counts = np.bincount(symbols)
     return order_0_entropy(counts[counts > 0])
 
@@ -294,12 +314,14 @@ def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
 
 
 def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
-    """Return data transformed by RUN_LENGTH; `None` if the mean length of the runs is below `least`.
+    """Return data transformed by RUN_LENGTH: values of the runs, low bytes of their lengths - 1, and high bytes.
+
+    `None` for fewer than `_RUN_BYTES_MIN` bytes, or if the mean length of the runs is below `least`, bytes.
 
     DEFLATE codes long runs poorly, as a match has at most 258 bytes. For short runs it needs a distance each, and a
     Huffman code that literals and lengths share; RUN_LENGTH separates values and lengths.
     """
-    if len(data) < 64:
+    if len(data) < _RUN_BYTES_MIN:
         return None
     changes = np.flatnonzero(data[1:] != data[:-1])
     if least * (len(changes) + 1) > len(data):
@@ -314,17 +336,17 @@ def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | No
     return np.concatenate([values, sizes.astype(np.uint8), (sizes >> 8).astype(np.uint8)])
 
 
-def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
-    """Return True if a quick trial compresses the runs to at most `_GAIN` of the planes."""
+def _run_length_pays(run_length: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
+    """Return True if a quick trial compresses the bytes with RUN_LENGTH to at most `_GAIN` of those without."""
     trial = trial_settings(deflate)
-    return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
+    return len(_code(run_length, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
 
 def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, bytes]:
-    """Return the coder with the smallest result, and the result."""
+    """Return the id of the coder with the smallest result, and the result; of equal sizes, STORED."""
     raw = packed.tobytes()
     best, coded = _spec.CODER_STORED, raw
-    if len(raw) > 3:
+    if len(raw) >= _DEFLATE_BYTES_MIN:
         deflated = _deflate(raw, deflate)
         if len(deflated) < len(coded):
             best, coded = _spec.CODER_DEFLATE, deflated
@@ -345,17 +367,19 @@ def _deflate_fast(raw: bytes) -> bytes:
     """Compress with the method that is best on samples: fast matches, runs of one byte, or only Huffman codes."""
     methods: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
     step = max(_SAMPLE, len(raw) // 4)
-    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
+    sample = b"".join(raw[start : start + _SAMPLE] for start in range(0, len(raw), step))
     return min(methods, key=lambda compress: len(compress(sample)))(raw)
 
 
 def _libdeflate(raw: bytes, level: int) -> bytes:
+    """Compress by libdeflate, level 1 to 12; the package must be installed."""
     import deflate  # optional: some platforms have no wheel
 
     return bytes(deflate.deflate_compress(raw, level))
 
 
 def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
+    """Compress by zlib to DEFLATE without a header (-15: window of 2**15 bytes), with the most memory (9)."""
     coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
     return coder.compress(raw) + coder.flush()
 

@@ -101,9 +101,9 @@ def value_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
     """Return (largest difference, sum of squared differences) over all components."""
     largest = squares = 0.0
     source, decoded = source.reshape(-1), decoded.reshape(-1)
-    for at in range(0, source.size, 8 * _BLOCK):
-        difference = decoded[at : at + 8 * _BLOCK].astype(np.float64)
-        difference -= source[at : at + 8 * _BLOCK]
+    for start in range(0, source.size, 8 * _BLOCK):
+        difference = decoded[start : start + 8 * _BLOCK].astype(np.float64)
+        difference -= source[start : start + 8 * _BLOCK]
         largest = max(largest, float(difference.max()), -float(difference.min()))
         squares += float(np.square(difference, out=difference).sum())
     return largest, squares
@@ -120,8 +120,8 @@ def covariance_errors(
     """
     # Scales are relative to the source's largest, so that nothing overflows.
     largest = squares = 0.0
-    for at in range(0, source_quats.shape[1], _BLOCK):
-        part = slice(at, at + _BLOCK)
+    for start in range(0, source_quats.shape[1], _BLOCK):
+        part = slice(start, start + _BLOCK)
         reference = np.clip(source_scales[:, part], -SCALE_MOST, SCALE_MOST).astype(np.float64)
         top = reference.max(axis=0)
         reference -= top
@@ -160,8 +160,8 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
     if len(index) and not (int(index.min()) >= 0 and int(index.max()) < len(source)):
         raise InputError(f"source index exceeds the source's {len(source)} splats")
     parts = []
-    for at in range(0, len(decoded), 4 * _BLOCK):
-        part = slice(at, at + 4 * _BLOCK)
+    for start in range(0, len(decoded), 4 * _BLOCK):
+        part = slice(start, start + 4 * _BLOCK)
         parts.append(_errors_of_rows(source, decoded, index[part], part))
     return ErrorSums.total(parts)
 
@@ -179,9 +179,9 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
     for band in range(1, max(source.sh_degree, decoded.sh_degree) + 1):
         span = slice(band * band - 1, (band + 1) * (band + 1) - 1)
         zeros = np.zeros((len(rows), 2 * band + 1, 3), np.float32)
-        before = source.shN[rows, span] if band <= source.sh_degree else zeros
-        after = decoded.shN[part, span] if band <= decoded.sh_degree else zeros
-        pairs[f"sh{band}"] = value_errors(np.ascontiguousarray(before), np.ascontiguousarray(after))
+        source_band = source.shN[rows, span] if band <= source.sh_degree else zeros
+        decoded_band = decoded.shN[part, span] if band <= decoded.sh_degree else zeros
+        pairs[f"sh{band}"] = value_errors(np.ascontiguousarray(source_band), np.ascontiguousarray(decoded_band))
     return ErrorSums(
         len(rows), {name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()}
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan
@@ -25,7 +26,11 @@ _COARSENESS = (-20.0, 20.0)  # range of the logarithm of the factor by which ste
 # Logarithms of an error relative to its bound: what new steps aim at, and errors that are near enough.
 _MARGIN, _TOLERANCE = 0.03, 0.1
 _LARGEST_STEP, _LEAST_STEP = 2.0, 0.02  # logarithm of the factor from one step to the next
-_KNOBS = {
+_SCALE_STEP_RATIO = 0.4  # first scale step, log scale, relative to the bound of the covariance; the search corrects it
+_QUAT_LEVELS_RATIO = 4.0  # first rotation levels, times that bound
+_QUAT_LEVELS_MIN = 8  # rotation levels
+_STEP_MIN, _STEP_MAX = 1e-6, 1e3  # range of the steps that `EncodeOptions` accepts
+_KNOBS = {  # options that set the steps of a family of measures
     "means": ("position_error", "position_step", "position_bits"),
     "covariance": ("scale_step", "quat_levels", "shape_codebook_size"),
     "opacities": ("opacity_levels",),
@@ -71,10 +76,11 @@ def meet_bounds(
         if options not in files:
             plan = EncodePlan.of(source, options, importance=importance, context=context)
             files[options] = encode_tiles(plan).write()
-        result, before = files[options], dict(coarseness)
+        result = files[options]
         ratios = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
         if max(ratios.values()) <= 1.0 and (best is None or result.size_bytes < best[0].size_bytes):
             best = result, options
+        adjusted = dict[str, float]()
         for family, excesses in measured.items():
             ratio = max(ratio for name, ratio in ratios.items() if _family(name) == family)
             excess = math.log(ratio or 1.0)  # without an error, steps need not be coarser
@@ -84,9 +90,10 @@ def meet_bounds(
                 largest_step=_LARGEST_STEP, least_step=_LEAST_STEP, tries=_TRIES,
             )  # fmt: skip
             met = [value for value, excess in excesses.items() if excess <= 0.0]
-            coarseness[family] = max(met, default=coarseness[family]) if proposed is None else proposed
-        if coarseness == before:
+            adjusted[family] = max(met, default=coarseness[family]) if proposed is None else proposed
+        if adjusted == coarseness:
             break
+        coarseness = adjusted
     if best is None:
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
@@ -107,23 +114,32 @@ def meet_bounds(
 
 
 def _options_for(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
-    """Return the options with steps that should keep the errors within bounds."""
+    """Return the options with steps that should keep the errors within bounds; encoding shows if they do.
+
+    Args:
+        source: the scene.
+        encoding: the caller's options.
+        bounds: largest error by measure, > 0.
+
+    Raises:
+        InputError: `encoding` sets an option that a bound determines, or drops or excludes bounded SH bands.
+    """
     chosen: dict[str, Any] = {}
     for name, bound in bounds.items():
         knobs = _KNOBS[_family(name)]
-        fixed = [knob for knob in knobs if getattr(encoding, knob) is not None]
-        if fixed:
-            raise InputError(f"{fixed[0]} is determined by the largest error of {name}: give only one of them")
+        already_set = [knob for knob in knobs if getattr(encoding, knob) is not None]
+        if already_set:
+            raise InputError(f"{already_set[0]} is determined by the largest error of {name}: give only one of them")
         if name == "means":
             chosen["position_error"] = bound
         elif name == "opacities":
-            chosen["opacity_levels"] = _clip_levels(1.0 / bound, 1, 65535)
+            chosen["opacity_levels"] = _clip_levels(1.0 / bound, 1, _spec.OPACITY_LEVELS_MAX)
         elif name == "covariance":
-            chosen["scale_step"] = _clip_step(0.4 * bound)
-            chosen["quat_levels"] = _clip_levels(4.0 / bound, 8, 32767)
+            chosen["scale_step"] = _clip_step(_SCALE_STEP_RATIO * bound)
+            chosen["quat_levels"] = _clip_levels(_QUAT_LEVELS_RATIO / bound, _QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX)
         else:
             step = _clip_step(math.exp(-_MARGIN) * bound)
-            chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
+            chosen[knobs[0]] = min(step, chosen.get(knobs[0], step))  # the bands of SH share a step
     if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
         if encoding.sh_coding == "none":
             raise InputError("sh_coding none drops the SH bands whose error is bounded")
@@ -138,12 +154,13 @@ def _options_for(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[st
     return replace(encoding, **chosen)
 
 
-def _clip_step(wanted: float) -> float:
-    """Return the nearest step that the encoder accepts."""
-    return min(max(wanted, 1e-6), 1e3)
+def _clip_step(step: float) -> float:
+    """Clip a step to the range `_STEP_MIN` to `_STEP_MAX`."""
+    return min(max(step, _STEP_MIN), _STEP_MAX)
 
 
 def _family(name: str) -> str:
+    """Return the key of `_KNOBS` for a measure: "sh" for the bands sh1 to sh4, its own name otherwise."""
     return "sh" if name.startswith("sh") and name != "sh0" else name
 
 

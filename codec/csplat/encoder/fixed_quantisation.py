@@ -126,9 +126,9 @@ class FixedQuantisation:
             sh = np.concatenate([_dequantise_entries(self.book.entries, parameters), sh[self.book.escaped]])
         quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
         if self.shapes is not None:
-            shared, own = self.shapes.entries, self.shapes.escaped
-            quats = np.concatenate([quat_values(shared[3:], parameters.quat_levels).T, quats[own]])
-            scales = np.concatenate([lattice_values(shared[:3], parameters.scale_step).T, scales[own]])
+            entries, escaped = self.shapes.entries, self.shapes.escaped
+            quats = np.concatenate([quat_values(entries[3:], parameters.quat_levels).T, quats[escaped]])
+            scales = np.concatenate([lattice_values(entries[:3], parameters.scale_step).T, scales[escaped]])
             sizes = lattice_values(self.shapes.summand, parameters.scale_step)
         values = FreeValues(model.means, quats, scales, model.opacities, model.sh0, sh, sizes).copy()
         self.constrain(values)
@@ -219,9 +219,9 @@ class FixedQuantisation:
         shapes = self._shape_values(values)[0]
         if shapes is None:
             return decoded.quats, decoded.scales, values.sizes
-        own, parameters = shapes.escaped, self.parameters
-        quats = np.concatenate([quat_values(shapes.entries[3:], parameters.quat_levels).T, decoded.quats[own]])
-        scales = np.concatenate([lattice_values(shapes.entries[:3], parameters.scale_step).T, decoded.scales[own]])
+        escaped, parameters = shapes.escaped, self.parameters
+        quats = np.concatenate([quat_values(shapes.entries[3:], parameters.quat_levels).T, decoded.quats[escaped]])
+        scales = np.concatenate([lattice_values(shapes.entries[:3], parameters.scale_step).T, decoded.scales[escaped]])
         return quats, scales, lattice_values(shapes.summand, parameters.scale_step)
 
     def sh_coarseness(self) -> I32 | None:
@@ -231,27 +231,36 @@ class FixedQuantisation:
         return sh_coarseness(np.arange(len(self.encode_plan.model)), self.parameters, self.sh_plan)
 
     def _dequantise_shapes(self, values: FreeValues) -> tuple[F32, F32]:
+        """Return quats [N, 4] and log scales [N, 3] as decoded."""
         shapes, quats, scales = self._shape_values(values)
         return dequantise_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)
 
     def _dequantise_escapes(self, book: ShCodebook, sh: F32) -> F32:
-        own = sh[book.size :]
-        return quantise_sh(own, self.parameters, np.full(len(own), self.parameters.escape_coarse, np.int32))[2]
+        """Return SH of the escaped splats as decoded, [n, K, 3]; they follow the entries in `sh`."""
+        escaped = sh[book.size :]
+        return quantise_sh(escaped, self.parameters, np.full(len(escaped), self.parameters.escape_coarse, np.int32))[2]
 
     def _shape_values(self, values: FreeValues) -> tuple[ShapeCodebook | None, F32, F32]:
-        """Return the shape codebook of the values, and quats [N, 4] and scales [N, 3], used only by escaped splats."""
+        """Return the shape codebook of the values, and quats [N, 4] and log scales [N, 3].
+
+        With a codebook, only the rows of escaped splats count: others have the identity and 0. Without one, it is
+        `None`, and the rows are those of the values.
+        """
         if self.shapes is None:
             return None, values.quats, values.scales
-        parameters, size, own = self.parameters, self.shapes.size, self.shapes.escaped
+        parameters, size, escaped = self.parameters, self.shapes.size, self.shapes.escaped
         scales = np.rint(values.scales[:size].T / parameters.scale_step)
         entries = np.concatenate([scales.astype(np.int32), quat_levels(values.quats[:size].T, parameters.quat_levels)])
         summand = np.rint(values.sizes / parameters.scale_step).astype(np.int32)
-        by_splat = np.zeros_like(self.encode_plan.model.quats), np.zeros_like(self.encode_plan.model.scales)
-        by_splat[0][:, 0] = 1.0
-        by_splat[0][own], by_splat[1][own] = values.quats[size:], values.scales[size:]
-        return ShapeCodebook(entries, self.shapes.index, summand), *by_splat
+        quats = np.zeros_like(self.encode_plan.model.quats)
+        quats[:, 0] = 1.0
+        quats[escaped] = values.quats[size:]
+        own_scales = np.zeros_like(self.encode_plan.model.scales)
+        own_scales[escaped] = values.scales[size:]
+        return ShapeCodebook(entries, self.shapes.index, summand), quats, own_scales
 
     def _requantise(self, book: ShCodebook, sh: F32) -> ShCodebook:
+        """Return the codebook with the first rows of `sh` as its entries, and the same assignment."""
         return ShCodebook(_quantise_entries(sh[: book.size], self.parameters), book.index)
 
 
@@ -283,7 +292,16 @@ def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> Fixe
 
 
 def _reorder(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
-    """Put splats into tile order [N] and canonical axis order, and drop the data that only an open SH coding needs."""
+    """Put splats into tile order and canonical axis order, and drop the data that only an open SH coding needs.
+
+    Args:
+        plan: the complete plan.
+        order: [N], rows of its splats, tile after tile.
+        counts: number of splats of each tile.
+
+    Returns:
+        A plan whose tiles are consecutive rows, and whose origin is marked as refitted.
+    """
     model = plan.model.select(order)
     rotation, scales = canonicalise_shape(model.quats, model.scales)
     ends = np.cumsum(counts)

@@ -30,7 +30,9 @@ from csplat.encoder.splat_importance import ErrorMetric, doubled_triangles, matr
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
-_Find = Callable[[F32, int, I64, F32], None]  # (rows [x, 1], index of the first row, entries, scores), last two updated
+# Searches entries for a block of n points: (rows [x, 1] of the points, [n, D + 1]; index of the first point; index of
+# the best entry so far, [n]; its score, [n]). Updates the last two in place.
+_Search = Callable[[F32, int, I64, F32], None]
 Floats = NDArray[Any]
 
 _SEED_ROUNDS = (8, 2)  # rounds in which the initial entries are drawn, for few points and for many
@@ -47,6 +49,7 @@ _BLAS = threading.RLock()  # a BLAS has one thread count per process: one search
 _CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of this entry
 _REFINE_ROUNDS = 2  # iterations under the metric
 _METRIC_BLOCK = 1 << 12  # points per block of temporaries
+_NEIGHBOUR_BLOCK = 256  # entries whose distances to all entries are in memory at a time
 _RIDGE = 1e-3  # fraction of the mean diagonal; keeps an entry in place along directions its points do not determine
 
 
@@ -92,13 +95,14 @@ def cluster(
     entries = _first_entries(sample, sample_w, size, rng, near_groups, context)
     index: U32 | None = None
     for step in range(iterations + 1):
-        most = size >> (2 + 4 * step // iterations) if step < iterations else 0
+        # A quarter of the entries may move at first, half as many after each quarter of the iterations, none at last.
+        moves_max = size >> (2 + 4 * step // iterations) if step < iterations else 0
         if step == iterations and len(sample) < len(points):
             rows, sample_w = _priority_sample(w, max(_REFINED_POINTS, size * _REFINED_PER_ENTRY), rng)
             sample, index = points[rows], None
         index, error = search_nearest(sample, entries, near_groups, context, start=index)
         entries = _move_to_means(sample, sample_w, index, entries)
-        _relocate(entries, index, sample, sample_w, error, most, min(near_groups, _NEXT_GROUPS), rng, context)
+        _relocate(entries, index, sample, sample_w, error, moves_max, min(near_groups, _NEXT_GROUPS), rng, context)
         context.progress("codebook", (step + 1) / (iterations + 2))
     is_sample = len(sample) < len(points)
     index = search_nearest(points, entries, near_groups, context, start=None if is_sample else index)[0]
@@ -174,10 +178,10 @@ def search_nearest(
     table = _table(coarse)
     if 0 < near_groups < math.isqrt(len(entries)):
         near = near_groups if start is None else min(near_groups, _NEXT_GROUPS)
-        find = _near_entries(coarse, table, near, context, exclude_own)
+        search = _near_entries(coarse, table, near, context, exclude_own)
     else:
         start = None
-        find = _every_entry(table, exclude_own)
+        search = _every_entry(table, exclude_own)
 
     def work(part: slice) -> None:
         rows = np.ones((part.stop - part.start, table.shape[1]), np.float32)
@@ -187,7 +191,7 @@ def search_nearest(
         if start is not None:
             nearest[:] = start[part]
             best[:] = np.einsum("nd,nd->n", rows, np.take(table, nearest, axis=0))
-        find(rows, part.start, nearest, best)
+        search(rows, part.start, nearest, best)
         index[part] = nearest
         norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
         error[part] = (norm - 2.0 * best) * 4.0**shift
@@ -227,13 +231,14 @@ def one_blas_thread() -> Iterator[None]:
     if control is None:
         yield
         return
+    get_thread_count, set_thread_count = control
     with _BLAS:
-        before = control[0]()
-        control[1](1)
+        previous = get_thread_count()
+        set_thread_count(1)
         try:
             yield
         finally:
-            control[1](before)
+            set_thread_count(previous)
 
 
 @one_blas_thread()
@@ -359,14 +364,15 @@ def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
 
 
 def _first_entries(sample: I16 | I32, w: F64, size: int, rng: np.random.Generator, near: int, context: Context) -> I32:
-    """Draw initial entries, [size, D], from a sample [n, D] with weights w [n].
+    """Draw initial entries, [size, D], from a sample [n, D] with weights w [n]; fewer if fewer points have w d² > 0.
 
     Rounds draw with a probability that grows with w d², d being the distance to earlier draws (Bahmani et al.,
-    "Scalable k-means++", but with exactly `size` points).
+    "Scalable k-means++", but with exactly `size` points); `near` is the number of groups searched for it, 0 for all.
     """
     error = np.ones(len(sample))
     entries = np.empty((0, sample.shape[1]), np.int32)
-    rounds = _SEED_ROUNDS[len(sample) > _FEW_POINTS]
+    few_rounds, many_rounds = _SEED_ROUNDS
+    rounds = few_rounds if len(sample) <= _FEW_POINTS else many_rounds
     for done in range(1, rounds + 1):
         new = sample[_draw_rows(w * error, size * done // rounds - len(entries), rng)]
         entries = np.concatenate([entries, new.astype(np.int32)])
@@ -394,7 +400,7 @@ def _relocate(
     points: I16 | I32,
     w: F64,
     error: F64,
-    most: int,
+    moves_max: int,
     near_groups: int,
     rng: np.random.Generator,
     context: Context,
@@ -403,17 +409,27 @@ def _relocate(
 
     K-means alone never moves an entry between distant clusters (Patanè and Russo, "The enhanced LBG algorithm"). Giving
     up an entry costs about its weight times the squared distance to its nearest neighbour; splitting a cluster saves
-    about half of its error. At most `most` entries with weight move, each to a point drawn from its new cluster.
-    Entries are [K, D], points [N, D]; index, w and error are [N].
+    about half of its error.
+
+    Args:
+        entries: [K, D], changed in place.
+        index: [N], the entry of each point, not changed.
+        points: [N, D].
+        w: [N], weights of the points.
+        error: [N], squared distance of each point to its entry.
+        moves_max: maximum number of entries to move, unless more have no weight; 0 moves only those without weight.
+        near_groups: groups searched for the nearest neighbour of an entry, 0 for all.
+        rng: draws the point of a cluster to which an entry moves.
+        context: threads.
     """
     weight = np.bincount(index, w, len(entries)).astype(np.float64)
     errors = np.bincount(index, w * error, len(entries))
     loss = weight
-    if most:  # the distance is infinite if the groups searched have no other entry
+    if moves_max:  # the distance is infinite if the groups searched have no other entry
         distance = search_nearest(entries, entries, near_groups, context, exclude_own=True)[1]
         loss = np.multiply(weight, distance, out=np.zeros_like(weight), where=weight > 0.0)
     cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-errors, kind="stable")
-    limit = max(most, int(np.count_nonzero(weight == 0)))
+    limit = max(moves_max, int(np.count_nonzero(weight == 0)))
     count = int(np.count_nonzero((loss[cheap] < errors[worst] / 2)[:limit]))
     if count:
         rows = np.flatnonzero(np.isin(index, worst[:count], kind="table"))
@@ -431,6 +447,7 @@ def _distinct(rows: I16 | I32) -> tuple[I32, U32]:
 
 
 def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
+    """Return the entries [K, D] that some point uses, in their order, and the points' index [N] among them."""
     used = np.bincount(index, minlength=len(entries)) > 0
     return entries[used], (np.cumsum(used) - 1).astype(np.uint32)[index]
 
@@ -455,6 +472,7 @@ def _largest_norm(rows: I16 | I32) -> float:
 
 
 def _divide(rows: I16 | I32, shift: int) -> I64:
+    """Return integers divided by 2**shift, rounded to the nearest, halves up."""
     return (rows.astype(np.int64) + ((1 << shift) >> 1)) >> shift
 
 
@@ -464,57 +482,70 @@ def _table(entries: I64) -> F32:
     return np.concatenate([entries, half[:, None]], axis=1).astype(np.float32)
 
 
-def _every_entry(table: F32, exclude_own: bool) -> _Find:
-    """Return a search of every entry in a `_table`, [K, D + 1]."""
+def _every_entry(table: F32, exclude_own: bool) -> _Search:
+    """Return a search of every entry in a `_table`, [K, D + 1]; `exclude_own` skips entry i for point i."""
     matrix = np.ascontiguousarray(table.T)
     width = min(matrix.shape[1], _PRODUCT_COLUMNS)
     step = _PRODUCT // width
 
-    def find(x: F32, start: int, index: I64, best: F32) -> None:
-        for at in range(0, len(x), step):
-            part = slice(at, at + step)
+    def search(x: F32, start: int, index: I64, best: F32) -> None:
+        for first_row in range(0, len(x), step):
+            part = slice(first_row, first_row + step)
             rows = np.arange(len(x[part]))
-            for k in range(0, matrix.shape[1], width):
-                scores = x[part] @ matrix[:, k : k + width]
+            for first_entry in range(0, matrix.shape[1], width):
+                scores = x[part] @ matrix[:, first_entry : first_entry + width]
                 if exclude_own:
-                    own = rows + (start + at - k)
-                    here = (own >= 0) & (own < scores.shape[1])
-                    scores[rows[here], own[here]] = -np.inf
-                _keep_better(rows, scores, k, index[part], best[part])
+                    own = rows + (start + first_row - first_entry)  # columns of the points' own entries
+                    inside = (own >= 0) & (own < scores.shape[1])
+                    scores[rows[inside], own[inside]] = -np.inf
+                _keep_better(rows, scores, first_entry, index[part], best[part])
 
-    return find
+    return search
 
 
-def _near_entries(entries: I64, table: F32, near: int, context: Context, exclude_own: bool) -> _Find:
-    """Return a search of the entries [K, D] in the `near` groups with the nearest centroids; `table` is [K, D + 1]."""
+def _near_entries(entries: I64, table: F32, near: int, context: Context, exclude_own: bool) -> _Search:
+    """Return a search of the entries in the `near` groups whose centroids are nearest to a point.
+
+    A point whose groups have no entry, or only its own that is excluded, keeps index and score.
+
+    Args:
+        entries: [K, D], which are grouped here.
+        table: [K, D + 1], the `_table` of the entries.
+        near: number of groups per point, > 0.
+        context: threads.
+        exclude_own: skip entry i for point i.
+    """
     centres, label = _groups(entries, context)
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(len(centres) + 1))
     matrices = [np.ascontiguousarray(table[order[a:b]].T) for a, b in pairwise(ends)]
     coarse = np.ascontiguousarray(_table(centres).T)
-    place = np.empty_like(order)
+    place = np.empty_like(order)  # the inverse of `order`
     place[order] = np.arange(len(order))
 
-    def find(x: F32, start: int, index: I64, best: F32) -> None:
-        nearest = np.empty_like(index)
-        before = best.copy()
-        for chosen, group in _by_group(x @ coarse, near):
+    def search(x: F32, start: int, index: I64, best: F32) -> None:
+        nearest = np.empty_like(index)  # positions in `order`
+        previous_best = best.copy()
+        for group_rows, group in _by_group(x @ coarse, near):
             width = matrices[group].shape[1]
-            for rows in np.array_split(chosen, -(-len(chosen) * width // _PRODUCT)) if width else ():
+            for rows in np.array_split(group_rows, -(-len(group_rows) * width // _PRODUCT)) if width else ():
                 scores = np.take(x, rows, axis=0) @ matrices[group]  # unlike x[rows], `take` releases the GIL
                 if exclude_own:
-                    own = place[rows + start] - ends[group]
-                    here = np.flatnonzero((own >= 0) & (own < width))
-                    scores[here, own[here]] = -np.inf
+                    own = place[rows + start] - ends[group]  # columns of the points' own entries
+                    inside = np.flatnonzero((own >= 0) & (own < width))
+                    scores[inside, own[inside]] = -np.inf
                 _keep_better(rows, scores, int(ends[group]), nearest, best)
-        better = best > before
+        better = best > previous_best
         index[better] = order[nearest[better]]
 
-    return find
+    return search
 
 
 def _by_group(scores: F32, near: int) -> Iterator[tuple[I64, int]]:
-    """Yield, for each group, the rows of which it is among the `near` groups with the highest scores [n, groups]."""
+    """Yield the rows of which a group is among the `near` with the highest scores [n, groups], and the group.
+
+    Groups ascend; a group without rows is omitted. The highest scores are overwritten.
+    """
     count, groups = scores.shape
     rows = np.arange(count)
     chosen = np.empty((near, count), np.uint16)  # NumPy sorts 16 bits by radix
@@ -524,14 +555,21 @@ def _by_group(scores: F32, near: int) -> Iterator[tuple[I64, int]]:
     flat = chosen.reshape(-1)
     order = np.argsort(flat, kind="stable")
     ends = np.searchsorted(flat[order], np.arange(groups + 1))
-    order %= count
+    order %= count  # from indices in `flat` to rows
     for group in range(groups):
         if ends[group] < ends[group + 1]:
             yield order[ends[group] : ends[group + 1]], group
 
 
 def _keep_better(rows: I64, scores: F32, first: int, index: I64, best: F32) -> None:
-    """Update entries and scores of `rows` where the scores [n, k] of the entries from `first` are higher."""
+    """Update `index` and `best` in place for the `rows` [n] that one of k further entries has a higher score for.
+
+    Args:
+        rows: [n], distinct rows of `index` and `best`.
+        scores: [n, k], k > 0, of the entries `first` to `first` + k - 1; of equal ones the first counts.
+        first: the entry of the first column.
+        index, best: entry and score of every point so far; equal scores keep the entry.
+    """
     column = scores.argmax(1)
     score = scores[np.arange(len(column)), column]
     better = np.flatnonzero(score > best[rows])
@@ -541,7 +579,11 @@ def _keep_better(rows: I64, scores: F32, first: int, index: I64, best: F32) -> N
 
 
 def _groups(entries: I64, context: Context) -> tuple[I64, U32]:
-    """Cluster entries [K, D] into about sqrt(K) groups by plain k-means; return centroids and labels [K]."""
+    """Cluster entries [K, D] into G = floor(sqrt(K)) groups by plain k-means; a group may be empty.
+
+    Returns:
+        The centroids, [G, D], rounded; the group of each entry, [K].
+    """
     count = math.isqrt(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]
@@ -575,16 +617,16 @@ def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
 
 
 def _neighbours(entries: Floats, candidates: int) -> I64:
-    """Return each entry and its nearest neighbours, [K, candidates], ascending."""
+    """Return the indices of each entry and its nearest neighbours, [K, min(candidates, K)], each row ascending."""
     flat = entries.reshape(len(entries), -1).astype(np.float64)
     squares = np.einsum("kd,kd->k", flat, flat)
     count = min(candidates, len(flat))
     near = np.empty((len(flat), count), np.int64)
-    for at in range(0, len(flat), 256):
-        part = slice(at, at + 256)
+    for start in range(0, len(flat), _NEIGHBOUR_BLOCK):
+        part = slice(start, start + _NEIGHBOUR_BLOCK)
         distance = squares - 2.0 * (flat[part] @ flat.T)
         rows = np.arange(len(distance))
-        distance[rows, at + rows] = -np.inf
+        distance[rows, start + rows] = -np.inf  # includes the entry itself, even if others are equal to it
         near[part] = np.argpartition(distance, count - 1, axis=1)[:, :count]
     return np.sort(near, axis=1)
 
@@ -604,14 +646,14 @@ def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64
         matrices[:, i, j] = matrices[:, j, i] = sums
     right = np.empty((count, size, channels))
     products = np.empty((len(points), size, channels))
-    for at in range(0, len(points), _METRIC_BLOCK):
-        part = slice(at, at + _METRIC_BLOCK)
+    for start in range(0, len(points), _METRIC_BLOCK):
+        part = slice(start, start + _METRIC_BLOCK)
         products[part] = matrix_products(metric.triangles[part], points[part])
     for d in range(size):
         for c in range(channels):
             right[:, d, c] = np.bincount(index, weights * products[:, d, c], count)
     ridge = _RIDGE * np.einsum("kii->k", matrices) / size
-    ridge[ridge == 0.0] = 1.0
+    ridge[ridge == 0.0] = 1.0  # an entry without weight stays
     matrices[:, range(size), range(size)] += ridge[:, None]
     right += ridge[:, None, None] * entries
     solved: I32 = np.rint(np.linalg.solve(matrices, right)).astype(np.int32)

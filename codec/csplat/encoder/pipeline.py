@@ -376,6 +376,7 @@ class _TileResult:
     coarsened: set[str] = field(default_factory=set)
 
     def add_errors(self, measure: str, errors: tuple[float, float]) -> None:
+        """Set the largest error and the sum of squares of a measure."""
         self.largest[measure], self.squares[measure] = errors
 
     def add_opacities(self, opacities: F32) -> None:
@@ -485,7 +486,8 @@ def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[Fi
     metadata, parameters = plan.model.metadata, plan.parameters
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if metadata.coordinate_system == UNSPECIFIED else tuple(metadata.coordinate_system)
-    flags = metadata.antialiased * _spec.SCENE_FLAG_ANTIALIASED | metadata.flat * _spec.SCENE_FLAG_FLAT
+    flags = _spec.SCENE_FLAG_ANTIALIASED if metadata.antialiased else 0
+    flags |= _spec.SCENE_FLAG_FLAT if metadata.flat else 0
     return SceneFields(
         sh_degree=parameters.sh_degree,
         scene_flags=flags,
@@ -504,7 +506,8 @@ def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
     model, origin = plan.model, plan.origin
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
     bounds = sorted((ids[name], *pair) for name, pair in declared_errors(errors, origin).items())
-    count, flags = origin.source_count, origin.refitted * _spec.ERROR_FLAG_REFITTED
+    count = origin.source_count
+    flags = _spec.ERROR_FLAG_REFITTED if origin.refitted else 0
     head = _spec.DeclaredErrorsHead(count, count - errors.count, model.sh_degree, flags, len(bounds))
     records = [_spec.pack_declared_error_record(_spec.DeclaredErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
     return _spec.pack_declared_errors_head(head) + b"".join(records)

@@ -109,9 +109,9 @@ def quat_levels(rotation: F32, levels: int, multiple: int = 1) -> I32:
         (near w = 0.5, for small M), all three are rounded towards 0.
     """
     scaled = rotation[1:] * np.float32(levels * _ROOT2 / multiple)
-    most = levels // multiple
+    q_max = levels // multiple
     q: I32 = np.rint(scaled).astype(np.int32)
-    np.clip(q, -most, most, out=q)
+    np.clip(q, -q_max, q_max, out=q)
     negative = (q * q).sum(axis=0, dtype=np.int64) * multiple**2 > 2 * levels * levels
     if negative.any():
         q[:, negative] = np.trunc(scaled[:, negative]).astype(np.int32)
@@ -122,9 +122,9 @@ def quat_values(q: I32, levels: int) -> F32:
     """Return w, x, y, z as the decoder computes them (spec 7.5), [4, n] float32."""
     c = 1.0 / (np.float64(levels) * _ROOT2)
     wide = q.astype(np.float64)
-    rest = 2.0 * levels * levels - (wide * wide).sum(axis=0)
+    w_squared = 2.0 * levels * levels - (wide * wide).sum(axis=0)
     values = np.empty((4, q.shape[1]), np.float32)
-    values[0] = np.sqrt(rest) * c
+    values[0] = np.sqrt(w_squared) * c
     values[1:] = wide * c
     return values
 
@@ -151,11 +151,11 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
     co = _round_multiples((r - b) * real(0.5**shift), kind, coarse)
     cg = _round_multiples((g - (r + b) * real(0.5)) * real(0.5**shift), kind, coarse)
     full_co, full_cg = co << shift, cg << shift
-    rest = r + g + b
-    rest -= full_cg + full_co - 2 * (full_co >> 1)
-    rest /= real(3)
-    rest += full_cg >> 1
-    return np.stack([_round_multiples(rest, kind, coarse), co, cg])
+    luma = r + g + b
+    luma -= full_cg + full_co - 2 * (full_co >> 1)
+    luma /= real(3)
+    luma += full_cg >> 1
+    return np.stack([_round_multiples(luma, kind, coarse), co, cg])
 
 
 def lift_colour(columns: Integers, shift: int) -> Integers:
@@ -215,8 +215,8 @@ def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -
     columns = np.empty((3, coefficients, n), _narrowest(2.0 * largest / step + 1.0 + 2.0**coarsest))
     decoded = np.empty(source.shape, np.float32)
     real = np.float32 if exponent == 0 else np.float64
-    for at in range(0, n, _ROWS):
-        part = slice(at, at + _ROWS)
+    for start in range(0, n, _ROWS):
+        part = slice(start, start + _ROWS)
         rgb = np.ascontiguousarray(source[part].transpose(2, 1, 0))
         multiples = None if coarse is None else coarse[part]
         quantised = colour_integers(rgb * real(1.0 / step), parameters.chroma_shift, multiples)
@@ -227,6 +227,7 @@ def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -
 
 
 def _narrowest(largest: float) -> type[np.signedinteger[Any]]:
+    """Return the narrowest of int8, int16 and int32 that holds every integer of a magnitude up to `largest`."""
     return np.int8 if largest < 127 else np.int16 if largest < 32767 else np.int32
 
 
@@ -276,7 +277,10 @@ def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion
 
 
 def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Quaternion:
-    """Multiply from the right by 1, i, j or k so that w has the largest magnitude; components are [N]."""
+    """Multiply quaternions, [N] per component, from the right by 1, i, j or k so that w has the largest magnitude.
+
+    Of equal magnitudes, w is preferred, then z, then y. The new w may be negative.
+    """
     aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
     x_leads = ax > np.maximum(aw, np.maximum(ay, az))
     y_leads = ~x_leads & (ay > np.maximum(aw, az))

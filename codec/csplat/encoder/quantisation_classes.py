@@ -128,9 +128,10 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
     classes[np.argsort(energy, kind="stable")] = np.arange(len(sample)) * count // len(sample)
     octaves = _octaves(sample, classes, integers)
     for _ in range(_ROUNDS_MAX):
-        before, classes = classes, _assign_classes(sample, integers, octaves)
-        if (classes == before).all():
+        reassigned = _assign_classes(sample, integers, octaves)
+        if (reassigned == classes).all():
             break
+        classes = reassigned
         octaves = _octaves(sample, classes, integers)
     splats = np.bincount(classes)[np.unique(classes)] * (len(errors) / len(sample))
     large: F64 = octaves[splats >= min(_CLASS_SPLATS_MIN, splats.max())]
@@ -138,7 +139,10 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
 
 
 def _octaves(errors: F64, classes: U8, integers: F64) -> F64:
-    """Return the octaves [K, A] of each used class at which an integer adds an error of 1 on average."""
+    """Return the octaves [K, A] of each used class at which an integer adds an error of 1 on average.
+
+    Errors are [N, A], classes [N], integers [A]. Octaves are limited to -`_FINER` and `_COARSER`.
+    """
     counts = np.bincount(classes)
     sums = np.stack([np.bincount(classes, column) for column in errors.T], axis=1)
     means = sums[counts > 0] / counts[counts > 0, None]
@@ -147,15 +151,18 @@ def _octaves(errors: F64, classes: U8, integers: F64) -> F64:
 
 
 def _assign_classes(errors: F64, integers: F64, octaves: F64) -> U8:
-    """Return the class of least cost for each splat, [N]; see the equation of this module."""
+    """Return the class of least cost for each splat, [N], the first of several; see the equation of this module.
+
+    Errors are [N, A], integers [A], octaves [K, A].
+    """
     distortion, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
     index = np.zeros(len(errors), np.uint8)
-    for at in range(0, len(errors), _BLOCK):
-        columns = np.ascontiguousarray(errors[at : at + _BLOCK].T)  # adding a few long rows is much faster
+    for start in range(0, len(errors), _BLOCK):
+        columns = np.ascontiguousarray(errors[start : start + _BLOCK].T)  # adding a few long rows is much faster
         least = np.full(columns.shape[1], np.inf)
         for number, factors in enumerate(distortion):
             cost = sum(factor * column for factor, column in zip(factors, columns, strict=True)) - saved[number]
-            index[at : at + _BLOCK][cost < least] = number
+            index[start : start + _BLOCK][cost < least] = number
             least = np.minimum(cost, least)
     return index
 
@@ -163,9 +170,17 @@ def _assign_classes(errors: F64, integers: F64, octaves: F64) -> U8:
 def _as_steps(
     parameters: CodingParameters, index: U8, octaves: F64, free: Sequence[str]
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Set the file's steps to the steps of the finest class, and express coarser steps as multiples of them.
+    """Set the file's steps to the finest of any class, attribute by attribute, and express the others relative to them.
 
-    `index` [N] is the class of each splat. `octaves`, [classes, attributes], has a column for each attribute of `free`.
+    Args:
+        parameters: the chosen steps.
+        index: [N], class of each splat.
+        octaves: [classes, attributes of `free`], log2 of the steps of the classes relative to the chosen steps.
+        free: attributes whose steps may change.
+
+    Returns:
+        The parameters with the new steps, and the classes that have splats; or, if only one class has splats, the
+        unchanged parameters and `None`.
     """
     used = np.unique(index)
     if len(used) < 2:

@@ -45,6 +45,7 @@ _IMPORTANT = 0.95  # quantile of the weights above which splats are quantised on
 _CLEAR = 0.2  # relative difference of rates that no DEFLATE level reverses; rates of trials are up to 13 % too high
 _COARSEST = 6  # log2 of the coarsest multiple of the SH step
 _SLACK = 1.0 + 2.0**-18  # factor that covers the rounding of float32 differences in declared errors
+_ENTRY_BITS_MIN = 4  # log2 of the smallest number of entries that is chosen
 _CODEBOOK_ID = 0
 
 
@@ -151,8 +152,9 @@ class _ErrorWeights:
         if self.metric is not None:
             return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
         squares = np.empty(len(difference))
-        for at in range(0, len(difference), _BLOCK):
-            squares[at : at + _BLOCK] = np.square(difference[at : at + _BLOCK], dtype=np.float64).sum(axis=1)
+        for start in range(0, len(difference), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            squares[part] = np.square(difference[part], dtype=np.float64).sum(axis=1)
         return np.asarray(squares * self.weights[rows])
 
 
@@ -239,7 +241,7 @@ def assign_splats(
     points = _lattice_points(model.shN, parameters, context)
     index = assign(points, rule.entries, near_groups=rule.near_groups, context=context).astype(np.int32)
     error_weights = _ErrorWeights(weights, None, measured=False)
-    errors = _errors(model.shN, index, rule.entries, parameters, error_weights, context)
+    errors = _entry_errors(model.shN, index, rule.entries, parameters, error_weights, context)
     index[errors >= rule.threshold] = sh_plan.book.size
     return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
 
@@ -329,13 +331,26 @@ def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParam
 def _encode_by_codebook(
     source: F32, book: ShCodebook, parameters: CodingParameters, sums: _BandSums
 ) -> dict[int, bytes]:
-    """Return the block of each band of [N, K, 3]: indices in band 1, and integers of escaped splats in every band."""
+    """Encode the SH of a tile by a codebook, and add its errors to `sums`.
+
+    Args:
+        source: [n, K, 3], the kept coefficients in decoding order.
+        book: the codebook with the assignment of these splats.
+        parameters: steps and kept bands.
+        sums: errors of the tile, changed in place.
+
+    Returns:
+        The block of each band: indices in band 1, and integers of escaped splats in every band.
+
+    Raises:
+        InputError: an escaped splat does not fit the file's lattice.
+    """
     decoded, escaped = book.dequantise(parameters), book.escaped
     coarse = np.full(len(escaped), parameters.escape_coarse, np.int32)
-    columns, exponent, own = quantise_sh(source[escaped], parameters, coarse)
+    columns, exponent, decoded_escapes = quantise_sh(source[escaped], parameters, coarse)
     if exponent:
         raise InputError("SH coefficients are too large for escapes of a codebook: use scalar SH coding")
-    decoded[escaped] = own
+    decoded[escaped] = decoded_escapes
     sums.add(source, decoded, 0)
     layers = {}
     for band in range(1, parameters.sh_degree + 1):
@@ -363,8 +378,8 @@ class _BandSums:
             return
         flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
         span = slice(first, first + difference.shape[1])
-        for at in range(0, len(flat), _BLOCK):
-            squares = np.square(flat[at : at + _BLOCK], dtype=np.float64).sum(axis=0)
+        for start in range(0, len(flat), _BLOCK):
+            squares = np.square(flat[start : start + _BLOCK], dtype=np.float64).sum(axis=0)
             self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
         np.abs(flat, out=flat)
         np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
@@ -391,7 +406,7 @@ def _reference_weight(weights: F32 | None) -> float:
 
 def _escapes_fit(largest: float, parameters: CodingParameters) -> bool:
     """Return True if every splat can be escaped; escapes are on the file's lattice, which tiles cannot coarsen."""
-    return 2.0 * largest < largest_exact(parameters.sh_step)
+    return 2.0 * largest < largest_exact(parameters.sh_step)  # chroma is a difference of two channels
 
 
 def _train(
@@ -402,7 +417,20 @@ def _train(
     options: EncodeOptions,
     context: Context,
 ) -> tuple[AssignmentRule, I32, float]:
-    """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
+    """Train a codebook, and escape the splats that it represents worst.
+
+    Args:
+        shN: [N, K', 3], of which the kept coefficients count.
+        error_weights: weights of the errors of these splats.
+        size: maximum number of entries.
+        parameters: step, kept bands, and fraction to escape.
+        options: `escape_fraction`, if the caller set it.
+        context: threads, seed and progress.
+
+    Returns:
+        The entries by frequency, with the rule for other splats; [N] entry of each splat, the number of entries for an
+        escaped one; weighted mean squared error, in which escaped splats count 0.
+    """
     weights = error_weights.weights
     points = _lattice_points(shN, parameters, context)
     effort = {}
@@ -414,7 +442,7 @@ def _train(
         clustered = _refine(shN, points, error_weights.metric, clustered, parameters, context)
     ranked, entries = rank_by_frequency(clustered[1], clustered[0])
     index = ranked.astype(np.int32)
-    errors = _errors(shN, index, entries, parameters, error_weights, context)
+    errors = _entry_errors(shN, index, entries, parameters, error_weights, context)
     escaped = _choose_escapes(shN, errors, parameters, options, error_weights)
     threshold = float(errors[escaped].min(initial=np.inf))
     errors[escaped] = 0.0
@@ -427,7 +455,16 @@ def _train(
 def _refine(
     shN: F32, points: I16, metric: ErrorMetric, book: tuple[I32, U32], parameters: CodingParameters, context: Context
 ) -> tuple[I32, U32]:
-    """Refine entries [E, 3 K] and index [N] under the metric, for points [N, 3 K] of `shN`."""
+    """Refine entries [E, 3K] and index [N] under the metric; return both, without unused entries.
+
+    Args:
+        shN: [N, K', 3], coefficients that `points` are rounded from.
+        points: [N, 3K], lattice integers.
+        metric: metric of the splats.
+        book: entries and index before.
+        parameters: step.
+        context: threads.
+    """
     entries, index = book
     count = points.shape[1] // 3
     targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
@@ -452,18 +489,31 @@ def _lattice_points(shN: F32, parameters: CodingParameters, context: Context) ->
 
 
 def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOptions) -> int:
-    """Return the number of entries; an entry costs about 20 bytes and reduces the distortion of its users."""
+    """Return the number of entries for `count` splats: the option, or by default a power of two.
+
+    The default is limited to `parameters.codebook_most`, which need not be a power of two. An entry costs about
+    20 bytes and reduces the distortion of its users.
+    """
     if options.codebook_size is not None:
         return options.codebook_size
     share = parameters.codebook_share
     size = max(count * share, min(_FULL_SHARE_SPLATS * share, count / _USERS_MIN))
-    return min(1 << max(round(float(log2(max(1.0, size)))), 4), parameters.codebook_most)
+    return min(1 << max(round(float(log2(max(1.0, size)))), _ENTRY_BITS_MIN), parameters.codebook_most)
 
 
-def _errors(
+def _entry_errors(
     shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights, context: Context
 ) -> F64:
-    """Return the weighted squared error of each splat, [N], infinite if a coefficient was clipped."""
+    """Return the weighted squared error of each splat, [N], if it takes its entry; infinite if it has to be escaped.
+
+    Args:
+        shN: [N, K', 3], of which the kept coefficients count.
+        index: [N], the entry of each splat.
+        entries: [E, 3K], lattice integers.
+        parameters: step and kept bands.
+        error_weights: weights of the errors of these splats.
+        context: threads.
+    """
     kept = parameters.sh_coefficients
     table = entries.astype(np.float32) * np.float32(parameters.sh_step)
     errors = np.empty(len(shN))
@@ -495,8 +545,8 @@ def _choose_escapes(
         return np.sort(worst[:count])
     candidates = worst[: _ESCAPE_CANDIDATES * count]
     source = shN[candidates, : parameters.sh_coefficients]
-    own = quantise_sh(source, parameters, np.full(len(candidates), parameters.escape_coarse, np.int32))[2]
-    gain = errors[candidates] - error_weights.errors((source - own).reshape(len(candidates), -1), candidates)
+    decoded = quantise_sh(source, parameters, np.full(len(candidates), parameters.escape_coarse, np.int32))[2]
+    gain = errors[candidates] - error_weights.errors((source - decoded).reshape(len(candidates), -1), candidates)
     if options.escape_fraction is None:
         count = max(min(count, int(np.count_nonzero(gain > 0.0))), clipped)
     return np.sort(candidates[np.argsort(-gain, kind="stable")[:count]])
@@ -506,6 +556,7 @@ def _codebook_rate(codebooks: FileCodebooks, book: ShCodebook) -> float:
     """Estimate the bytes per splat of the entries and, by their entropy, of the indices."""
     entries = sum(len(chunk.payload) for chunk in codebooks.chunks) / len(book.index)
     shares = np.bincount(book.index) / len(book.index)
+    # 1e-12 stands for a share of 0, which adds nothing; 8 bits are a byte.
     return entries - float((shares * log2(np.maximum(shares, 1e-12))).sum()) / 8
 
 
@@ -523,6 +574,15 @@ def _codebook_pays(
     Scalar coding is tried on a few splats at two steps, between which its rate R is linear in the logarithm of the
     distortion D. The codebook has the distortion D_book; scalar coding would save s · log2(D_book / D) with
     s = -ΔR / Δlog2 D, which is added to the rate of the codebook. Quick DEFLATE decides if the rates differ clearly.
+
+    Args:
+        model: the scene.
+        error_weights: weights of the errors of its splats.
+        book: the codebook, with an assignment.
+        rate: bytes per splat of the codebook, without escapes.
+        distortion: weighted mean squared error with the codebook.
+        trial: [n], rows on which scalar coding is tried, n > 0.
+        parameters: step of scalar coding, and settings of DEFLATE.
     """
     share = float((book.index == book.size).mean())  # escapes
     scalar_rate = codebook_rate = 0.0
@@ -534,7 +594,7 @@ def _codebook_pays(
         codebook_rate = rate + share * scalar_rate
         if 0.0 < fine_distortion < coarse_distortion:
             slope = (scalar_rate - coarse_rate) / float(log2(coarse_distortion / fine_distortion))
-            codebook_rate += slope * float(log2(max(distortion, 1e-30) / fine_distortion))
+            codebook_rate += slope * float(log2(max(distortion, 1e-30) / fine_distortion))  # finite if it is 0
         if deflate == parameters.deflate or abs(codebook_rate - scalar_rate) > _CLEAR * scalar_rate:
             break
     return codebook_rate < scalar_rate

@@ -279,6 +279,10 @@ def mean_axes(covariances: F64) -> tuple[F32, F32]:
 
 
 def _canonical(quats: F32, scales: F32, parameters: CodingParameters) -> tuple[F32, F32]:
+    """Return quats [n, 4] and scales [n, 3] as columns [4, n] and [3, n] in canonical axis order.
+
+    With `parameters.canonical` they are in this order already.
+    """
     return (quats.T, scales.T) if parameters.canonical else canonicalise_shape(quats, scales)
 
 
@@ -308,7 +312,10 @@ class _ShapeInput:
 def _shape_input(
     model: SplatModel, weights: F32, metric: ErrorMetric | None, parameters: CodingParameters
 ) -> _ShapeInput:
-    """Return the shapes of a model in canonical axis order, and their rate and distortion; weights are [N]."""
+    """Return the shapes of a model in canonical axis order, and their rate and distortion without a codebook.
+
+    Weights are [N]; the metric, if known, has its own. Errors of splats for which `fits` is false have no meaning.
+    """
     rotation, scales = _canonical(model.quats, model.scales, parameters)
     covariances, sizes = unit_covariances(rotation, scales)
     fits = np.abs(scales).max(axis=0) < _STEPS_MAX * parameters.scale_step
@@ -359,7 +366,8 @@ def _train_entries(
     points = _points(shapes.covariances)
     _, start = cluster(points, weights.astype(np.float32), size, context=context)
     entries, index = np.zeros((6, 0), np.int32), start.astype(np.int64)
-    for _ in range(1 if shapes.metric is None else _METRIC_ROUNDS):
+    rounds = 1 if shapes.metric is None else _METRIC_ROUNDS  # one round quantises the centroids of k-means
+    for _ in range(rounds):
         entries = _centroids(shapes, weights, index, parameters)
         index = _assign(shapes, points, entries, parameters, context)
     return entries, index
@@ -442,6 +450,7 @@ def _all_but_worst(shapes: _ShapeInput, errors: F64, fraction: float) -> Mask:
 
 
 def _entropy(values: NDArray[Any]) -> float:
+    """Return the order-0 entropy of values [n], bits per value."""
     return entropy.order_0_entropy(np.unique(values, return_counts=True)[1])
 
 
@@ -457,8 +466,15 @@ def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> Sha
 def _keep_where_smaller(
     model: SplatModel, codebook: ShapeCodebook, tiles: Sequence[TileSplats], parameters: CodingParameters
 ) -> ShapeCodebook | None:
-    """Escape all splats of tiles that are not smaller with the codebook; return `None` if the file is not smaller."""
-    escaped, saved = codebook.escaped, 0
+    """Escape all splats of tiles that are not smaller with the codebook.
+
+    Tiles whose scales need a coarser lattice than the file's are escaped, too: codebooks are on the file's lattice.
+
+    Returns:
+        The codebook without entries that are no longer used; `None` if it takes more bytes than the tiles save.
+    """
+    escaped = codebook.escaped
+    saved = 0  # bytes
     for tile in tiles:
         rows = quantise_and_sort(model, tile, parameters).rows
         part = codebook.part(rows)
@@ -466,7 +482,7 @@ def _keep_where_smaller(
             continue
         quats, scales = model.quats[rows], model.scales[rows]
         plain = quantise_shape(quats, scales, parameters)
-        gain = -1
+        gain = -1  # bytes; escapes the tile
         if plain.exponent == 0:
             assigned = quantise_shape(quats, scales, parameters, part)
             gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - _CODEBOOK_ID_SIZE
@@ -481,13 +497,14 @@ def _keep_where_smaller(
 
 
 def _shape_bytes(shape: QuantisedShape, part: ShapePart | None, parameters: CodingParameters) -> int:
+    """Return the bytes of a tile's blocks of scales and quats, with a codebook if `part` is given."""
     return sum(
         len(block) for block in shape_blocks(shape.scales, shape.exponent, shape.quats, part, parameters.deflate)
     )
 
 
 def _quaternions(R: F64) -> F64:
-    """Return quaternions [n, 4] of rotation matrices.
+    """Return unit quaternions w x y z, [n, 4], of rotation matrices [n, 3, 3], the largest component > 0.
 
     The rows of 4 q qᵀ are computed from R; the row with the largest diagonal entry is normalised.
     """

@@ -64,6 +64,7 @@ class Importance:
         """Return the importance of some splats."""
 
         def select_rows(array: Floats | None) -> Floats | None:
+            """Return `rows` of an array; `None` if the importance does not have it."""
             return None if array is None else array[rows]
 
         return Importance(
@@ -135,8 +136,8 @@ class ErrorMetric:
     def products(self, a: Floats, b: Floats) -> F64:
         """Return aᵀ M b for every point, [N], without weights; a and b are [N, D, C]."""
         products = np.empty(len(a))
-        for at in range(0, len(a), _METRIC_BLOCK):
-            part = slice(at, at + _METRIC_BLOCK)
+        for start in range(0, len(a), _METRIC_BLOCK):
+            part = slice(start, start + _METRIC_BLOCK)
             products[part] = np.einsum("nic,nic->n", a[part], matrix_products(self.triangles[part], b[part]))
         return products
 
@@ -145,8 +146,8 @@ class ErrorMetric:
         triangles, weights = self.triangles[rows], self.weights[rows]
         upper_i, upper_j = np.triu_indices(self.size)
         errors = np.empty(len(difference))
-        for at in range(0, len(difference), _METRIC_BLOCK):
-            part = slice(at, at + _METRIC_BLOCK)
+        for start in range(0, len(difference), _METRIC_BLOCK):
+            part = slice(start, start + _METRIC_BLOCK)
             d = difference[part].astype(np.float64)
             products = np.einsum("npc,npc->np", d[:, upper_i], d[:, upper_j])
             errors[part] = np.einsum("np,np->n", products, doubled_triangles(triangles[part])) * weights[part]
@@ -171,20 +172,20 @@ def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> 
         importance = importance.sh
     if importance is None:
         weights = np.empty(len(model), np.float32)
-        for at in range(0, len(model), _WEIGHT_BLOCK):
-            part = slice(at, at + _WEIGHT_BLOCK)
+        for start in range(0, len(model), _WEIGHT_BLOCK):
+            part = slice(start, start + _WEIGHT_BLOCK)
             scales = model.scales[part]
             with np.errstate(over="ignore"):  # infinity is clipped
                 size = (scales.sum(axis=1) - scales.min(axis=1)) * np.float32(0.5)
             np.clip(size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX, out=size)
             weights[part] = model.opacities[part] * exp(size)
         return weights
-    given = np.asarray(importance)
-    if given.shape != (len(model),):
-        raise InputError(f"importance has shape {given.shape}, expected ({len(model)},)")
-    if given.dtype.kind not in "biuf":
-        raise InputError(f"importance has dtype {given.dtype}, expected real numbers")
-    values = given.astype(np.float64)
+    array = np.asarray(importance)
+    if array.shape != (len(model),):
+        raise InputError(f"importance has shape {array.shape}, expected ({len(model)},)")
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"importance has dtype {array.dtype}, expected real numbers")
+    values = array.astype(np.float64)
     if not (np.isfinite(values).all() and (values >= 0).all()):
         raise InputError("importance is negative or not finite")
     top = float(values.max(initial=0.0))
@@ -286,8 +287,8 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
         errors[:, 0] = blocks.opacities * alpha * (4.0 / squared_levels)  # alpha = q² / M²
         errors[:, 3] = blocks.means.astype(np.float64) * steps[2]
         errors[:, 4] = blocks.colours * (rgb * steps[3])
-        for at in range(0, len(model), _SHAPE_BLOCK):
-            part = slice(at, at + _SHAPE_BLOCK)
+        for start in range(0, len(model), _SHAPE_BLOCK):
+            part = slice(start, start + _SHAPE_BLOCK)
             sizes, turns = _shape_curvatures(model, blocks, part)
             errors[part, 1], errors[part, 2] = sizes * steps[0], turns * steps[1]
         errors *= _UNIFORM

@@ -68,13 +68,13 @@ class Target:
         for name, value in {**{name: getattr(self, name) for name in (*_ASKED, "effort")}, **self.max_error}.items():
             if value is not None and not isinstance(value, Real):
                 raise InputError(f"{name} is {value!r}, expected a number")
-        given = [words for name, words in _ASKED.items() if getattr(self, name) is not None]
-        if not given and not self.max_error:
+        requested = [words for name, words in _ASKED.items() if getattr(self, name) is not None]
+        if not requested and not self.max_error:
             raise InputError("no target, expected a size, a PSNR, a drop of PSNR, a kept fraction or largest errors")
-        if len(given) > 1:
-            raise InputError(f"{' and '.join(given)} are given, expected only one of them")
+        if len(requested) > 1:
+            raise InputError(f"{' and '.join(requested)} are given, expected only one of them")
         if self.max_error and (self.keep is not None or self.max_psnr_drop is not None):
-            raise InputError(f"largest errors exclude {given[0]}: pruned and refitted splats have no bounds")
+            raise InputError(f"largest errors exclude {requested[0]}: pruned and refitted splats have no bounds")
         if self.keep is not None and not self.prune:
             raise InputError("a kept fraction excludes prune=False")
         if self.psnr is not None and not 0.0 < self.psnr <= PSNR_CAP:
@@ -126,8 +126,8 @@ class Target:
 
     def as_json(self) -> dict[str, Any]:
         """Return the targets that are set, by name."""
-        given = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
-        return {**given, "max_error": dict(self.max_error)} if self.max_error else given
+        targets = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
+        return {**targets, "max_error": dict(self.max_error)} if self.max_error else targets
 
 
 def _file_size(size: Size) -> int:

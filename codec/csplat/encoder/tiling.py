@@ -141,11 +141,11 @@ def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
         lattice: step and bits.
     """
     # One step is reserved for rounding at both ends.
-    needed = _log2(extent / lattice.step / ((1 << lattice.bits) - 2 if lattice.bits > 1 else 1))
-    floor = _log2(reach / lattice.step / _FINEST)
+    needed = _exponent(extent / lattice.step / ((1 << lattice.bits) - 2 if lattice.bits > 1 else 1))
+    floor = _exponent(reach / lattice.step / _FINEST)
     if not lattice.finest:
         return max(0, needed, floor)
-    lowest = -1020 - math.frexp(lattice.step)[1]
+    lowest = -1020 - math.frexp(lattice.step)[1]  # the tile's step is a normal float64, at least 2**-1021
     if reach == 0.0:
         return 0
     return max(lowest, floor) if extent == 0.0 else max(lowest, needed, floor)
@@ -190,7 +190,21 @@ def dequantise_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters
 def _cut_groups(
     model: SplatModel, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
 ) -> list[TileSplats]:
-    """Cut each of the `groups` [n] of splats `rows` [n] into tiles; its class is its number modulo the classes."""
+    """Cut the splats of each group into tiles of their own.
+
+    Args:
+        model: the scene.
+        rows: [n], rows of the splats.
+        groups: [n], class + number of classes × mask of attributes with outliers; `None`: one group of class 0.
+        factors: step factors of each class.
+        parameters: steps and tile size.
+
+    Returns:
+        Tiles by ascending group, with rows of the model.
+
+    Raises:
+        InputError: no lattice keeps the error of means that `parameters` allow.
+    """
     tiles: list[TileSplats] = []
     for group in (0,) if groups is None else np.unique(groups):
         chosen = rows if groups is None else rows[groups == group]
@@ -204,15 +218,28 @@ def _cut_groups(
 
 
 def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
-    """Cut the splats `rows` [n] into tiles, finer where means would move by more than the lattice allows.
+    """Cut splats into tiles, finer where means would move by more than the lattice allows.
 
     Half a step per axis is within the error, but decoded means are rounded to float32, by up to another half.
+
+    Args:
+        model: the scene.
+        rows: [n], rows of the splats.
+        lattice: step, bits, and the error to keep, if any.
+        tile_splats: maximum number of splats per tile.
+
+    Returns:
+        Tiles in spatial order. Their rows index `rows`, not the model.
+
+    Raises:
+        InputError: after `_FINER_MAX` halvings of the step, a mean still moves too far.
     """
     tiles = cut_tiles(np.take(model.means, rows, axis=0), lattice, tile_splats)
     if lattice.error is None:
         return tiles
-    kept, worst, place = list[TileSplats](), lattice.error, 0.0
-    pending = [(tile, 0) for tile in reversed(tiles)]
+    kept = list[TileSplats]()
+    worst, reach = lattice.error, 0.0  # the largest error above the limit, and the reach of its tile, scene units
+    pending = [(tile, 0) for tile in reversed(tiles)]  # with the number of halvings; the next tile is last
     while pending:
         tile, finer = pending.pop()
         means = np.take(model.means, rows[tile.rows], axis=0)
@@ -222,7 +249,7 @@ def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: in
         if error <= lattice.error or finer == _FINER_MAX:
             kept.append(tile)
             if error > worst:
-                worst, place = error, float(np.abs(means).max())
+                worst, reach = error, float(np.abs(means).max())
             continue
         half = replace(lattice, step=math.ldexp(lattice.step, -finer - 1))
         pending += (
@@ -232,14 +259,14 @@ def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: in
     if worst > lattice.error:
         raise InputError(
             f"no lattice keeps the error of means within {lattice.error:g}: the best possible is {worst:.3g}, for a"
-            f" splat {place:.3g} from the origin (decoded means are float32); allow a larger error, or remove distant"
+            f" splat {reach:.3g} from the origin (decoded means are float32); allow a larger error, or remove distant"
             " splats (csplat convert --drop-floaters)"
         )
     return kept
 
 
 def _outlier_flags(model: SplatModel, parameters: CodingParameters) -> U8 | None:
-    """Return a bit mask of the attributes with outliers, [N]; `None` if no splat has any."""
+    """Return which attributes of each splat have outliers, [N]: bit 0 scales, 1 sh0, 2 kept SH bands; `None`: none."""
     # Chroma is a difference of two channels, hence half the limit for colours.
     limits = (
         (model.scales, largest_exact(parameters.scale_step)),
@@ -268,14 +295,22 @@ def _may_exceed(values: F32, limit: float) -> bool:
 def _exceeds(values: F32, limit: float) -> Mask:
     """Return True for rows with a value that reaches the limit, [N]."""
     mask = np.zeros(len(values), bool)
-    for at in range(0, len(values), _OUTLIER_BLOCK):
-        part = values[at : at + _OUTLIER_BLOCK]
-        mask[at : at + _OUTLIER_BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
+    for start in range(0, len(values), _OUTLIER_BLOCK):
+        part = values[start : start + _OUTLIER_BLOCK]
+        mask[start : start + _OUTLIER_BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
     return mask
 
 
 def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
-    """Split [n] at a multiple of the tile size, so that tiles are full; the first half is last, to be popped first."""
+    """Split at a quantile that lets tiles of both halves be about equally full.
+
+    Args:
+        coordinate: [n], n > `tile_splats`, positions along the axis to split.
+        tile_splats: maximum number of splats per tile.
+
+    Returns:
+        Rows of the far half and rows of the near half, in this order, so that the near half is popped first.
+    """
     parts = math.ceil(len(coordinate) / tile_splats)
     share = len(coordinate) * (parts // 2) // parts
     limit = np.partition(coordinate, share)[share]
@@ -285,5 +320,6 @@ def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
     return [np.flatnonzero(~near), np.flatnonzero(near)]
 
 
-def _log2(ratio: float) -> int:
+def _exponent(ratio: float) -> int:
+    """Return log2 rounded up; for a ratio of 0, a number below the logarithm of every float64."""
     return -(1 << 12) if ratio <= 0.0 else ceil_log2(ratio)

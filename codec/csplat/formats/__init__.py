@@ -102,7 +102,7 @@ def read_scene(
     """Read a scene into memory as `read` does, with its findings, format, name and size."""
     if is_url(file):
         with open(file, format, sh_degree=sh_degree) as opened:
-            return _loaded(opened, strict=strict, keep_extra=keep_extra)
+            return _load_scene(opened, strict=strict, keep_extra=keep_extra)
     with local_file(file) as path:
         file_format, findings = detect_format(path, format), list[Finding]()
         if file_format.name == _PLY:
@@ -112,12 +112,13 @@ def read_scene(
             model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, file_format.degree))
         else:
             with open(path, format, sh_degree=sh_degree) as opened:
-                return _loaded(opened, strict=strict, keep_extra=keep_extra)
+                return _load_scene(opened, strict=strict, keep_extra=keep_extra)
         scene = Scene.of(model if keep_extra or not model.extra else replace(model, extra={}))
         return scene.changed(findings=findings, format=file_format.name, name=path.name, size_bytes=size_on_disk(path))
 
 
-def _loaded(opened: Scene, *, strict: bool, keep_extra: bool) -> Scene:
+def _load_scene(opened: Scene, *, strict: bool, keep_extra: bool) -> Scene:
+    """Return a scene with all splats in memory; raise an `InputError` if its findings require that (`refuse`)."""
     scene = (opened if keep_extra else opened.without_extra()).loaded()
     refuse(scene.findings, strict=strict)
     return scene
@@ -181,7 +182,7 @@ def open(
                 return _version_of(_CSPLAT_FORMAT, opened, store.name, level, max_splats, sh_degree).keep_open(
                     stack.pop_all()
                 )
-            file = stack.enter_context(_copied(store))
+            file = stack.enter_context(_local_copy(store))
         elif storage:
             raise InputError("storage options require a URL, and the file is not one")
         path = stack.enter_context(local_file(file))
@@ -189,7 +190,7 @@ def open(
         scene = stack.enter_context(
             SplatFile.open(path, limits=limits)
             if file_format.name == _CSPLAT
-            else _opened(file_format, path, level, max_splats, sh_degree)
+            else _open_format(file_format, path, level, max_splats, sh_degree)
         )
         scene = _version_of(file_format, scene, path.name, level, max_splats, sh_degree)
         if not scene.format:
@@ -214,7 +215,7 @@ def lint_file(path: Path) -> list[Finding]:
     file_format = detect_format(path)
     if file_format.name == _PLY:
         return lint_ply(path)
-    with _opened(file_format, path) as scene:
+    with _open_format(file_format, path) as scene:
         if all(finding.repairable for finding in scene.findings):
             try:
                 for _ in _along_default_axes(file_format, scene).blocks():
@@ -295,12 +296,14 @@ def survey_losses(levels: Sequence[Scene], format: str) -> list[Finding]:
 
 
 def _clamp_statistics() -> ClampStatistics:
+    """Return empty statistics for `_clamped_values`."""
     from csplat.formats.common import ClampStatistics  # imported lazily: reading does not load the encoder
 
     return ClampStatistics()
 
 
 def _lost_contents(file_format: Format, levels: Sequence[Scene]) -> list[Finding]:
+    """Return a finding about contents that the format cannot hold; none without levels or losses."""
     lost = file_format.losses(levels[0]) if levels else ()
     text = f"{file_format.title} cannot hold {', '.join(lost)}"
     return [Finding("lost-contents", len(lost), text, "loss")] if lost else []
@@ -430,8 +433,8 @@ def _find(name: str) -> Format | None:
 
 
 @contextmanager
-def _copied(store: Store) -> Iterator[Path]:
-    """Copy a file to a temporary folder."""
+def _local_copy(store: Store) -> Iterator[Path]:
+    """Copy a file to a temporary folder under its own name, or as "data" without one; removed on exit."""
     with temporary_folder() as folder:
         path = folder / (PurePosixPath(urlsplit(store.name).path).name or "data")
         with open_binary(path, "x") as stream:
@@ -440,10 +443,14 @@ def _copied(store: Store) -> Iterator[Path]:
         yield path
 
 
-def _opened(
+def _open_format(
     file_format: Format, path: Path, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
 ) -> AbstractContextManager[Scene]:
-    """Open a file of another format than csplat."""
+    """Open a file of another format than csplat.
+
+    Raises:
+        InputError: both `level` and `max_splats` are given, or a level of a format without levels.
+    """
     check_sh_degree(sh_degree)
     assert file_format.open is not None
     if level and max_splats is not None:
@@ -473,5 +480,6 @@ def _version_of(
 
 
 def _along_default_axes(file_format: Format, scene: Scene) -> Scene:
+    """Rotate a scene to the default axes and keep its own as `file_axes`; unchanged for a format without fixed axes."""
     file_axes = scene.metadata.coordinate_system
     return convert_axes(scene, DEFAULT_AXES).changed(file_axes=file_axes) if file_format.axes else scene

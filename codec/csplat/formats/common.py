@@ -49,7 +49,8 @@ def finite_scene(
     Returns:
         The scene; its findings contain an error if there are rows but none is finite.
     """
-    total, kept, blank, scale_range, statistics = 0, 0, 0, RangeStatistics(), RowStatistics()
+    total = kept_count = blank_count = 0
+    scale_range, statistics = RangeStatistics(), RowStatistics()
     for rows, *_ in blocks():
         good = _finite_rows(rows)
         finite = rows if good.all() else rows[good]
@@ -58,27 +59,27 @@ def finite_scene(
         colours = [finite["shN"]] if "shN" in (rows.dtype.names or ()) and finite["shN"].dtype.kind == "f" else []
         huge = max(scale_range.most, -scale_range.least) > _HUGE
         statistics.huge += count_huge_rows(log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
-        blank += _count_empty_rows(rows)
+        blank_count += _count_empty_rows(rows)
         zero = np.logical_and.reduce([finite["quats"][:, part] == zero_quat for part in range(4)])
         statistics.zero_quats += int(np.count_nonzero(zero))
         total += len(rows)
-        kept += len(finite)
-    statistics.nonfinite = total - kept
+        kept_count += len(finite)
+    statistics.nonfinite = total - kept_count
     are_logs, findings = classify_scales(scale_range, "scale", strict=False)
     findings = list_findings(statistics, total) + findings
-    if blank:
-        text = f"{counted(blank, 'splat')} whose bytes are all 0, which are invisible: kept"
-        findings.append(Finding("zero-rows", blank, f"{text}; an interrupted download may leave them", "note"))
+    if blank_count:
+        text = f"{counted(blank_count, 'splat')} whose bytes are all 0, which are invisible: kept"
+        findings.append(Finding("zero-rows", blank_count, f"{text}; an interrupted download may leave them", "note"))
 
     def models() -> Iterator[SplatModel]:
         for parts in blocks():
             good = _finite_rows(parts[0])
             if good.any():
-                kept = parts if good.all() else tuple(part[good] for part in parts)
-                scales = kept[0]["scales"].astype(np.float32)
-                yield decode(scales if are_logs else log_scales(scales), *kept)
+                finite = parts if good.all() else tuple(part[good] for part in parts)
+                scales = finite[0]["scales"].astype(np.float32)
+                yield decode(scales if are_logs else log_scales(scales), *finite)
 
-    return Scene.like(empty, kept, models, findings)
+    return Scene.like(empty, kept_count, models, findings)
 
 
 def _count_empty_rows(rows: Rows) -> int:
@@ -230,7 +231,9 @@ class ClampStatistics:
             text = f"{counted(values, 'value')} of {name} in {counted(rows, 'splat')} outside {stored.low:.4g} to"
             text += f" {stored.high:.4g}, the range of {title}: clamped, by up to {error:.3g}"
             text += _clamped_sizes(name, stored, worst)
-            text += f"; {', '.join(others[:-1])}{' and ' * (len(others) > 1)}{others[-1]} hold them" if others else ""
+            if others:
+                *first, last = others
+                text += f"; {', '.join(first)}{' and ' if first else ''}{last} hold them"
             findings.append(Finding("clamped-values", rows, text, "loss", attribute=name, largest_error=error))
         return findings
 
@@ -239,7 +242,8 @@ def _clamped_sizes(name: str, stored: ValueRange, clamped: RangeStatistics) -> s
     """Describe clamped logarithms of scales as sizes; return "" for other attributes."""
     if name != "scales":
         return ""
-    ends = [(clamped.most, stored.high)] * bool(clamped.above) + [(clamped.least, stored.low)] * bool(clamped.below)
+    ends = [(clamped.most, stored.high)] if clamped.above else []
+    ends += [(clamped.least, stored.low)] if clamped.below else []
     sizes = (f"{np.exp(np.float64(value)):.3g} becomes {np.exp(np.float64(end)):.3g}" for value, end in ends)
     return f" (a size of {', one of '.join(sizes)} scene units)"
 
@@ -426,14 +430,14 @@ class SortedParts:
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[SplatModel]:
         """Yield the splats of some parts in blocks, of which all but the last are full."""
-        left: list[Rows] = []
+        pending: list[Rows] = []  # empty, or one array of rows not yet yielded
         for rows in self.rows(start, len(self.counts) if stop is None else stop):
-            left = [np.concatenate([*left, rows])]
-            while len(left[0]) >= BLOCK_SPLATS:
-                yield _model_of_rows(self.empty, left[0][:BLOCK_SPLATS])
-                left = [left[0][BLOCK_SPLATS:]]
-        if left and len(left[0]):
-            yield _model_of_rows(self.empty, left[0])
+            pending = [np.concatenate([*pending, rows])]
+            while len(pending[0]) >= BLOCK_SPLATS:
+                yield _model_of_rows(self.empty, pending[0][:BLOCK_SPLATS])
+                pending = [pending[0][BLOCK_SPLATS:]]
+        if pending and len(pending[0]):
+            yield _model_of_rows(self.empty, pending[0])
 
 
 @contextmanager
@@ -478,8 +482,18 @@ def sorted_parts(scene: Scene, folder: Path, keys: Callable[[F32], I64], splits:
 def _merge_runs(
     spool: IO[bytes], runs: Sequence[I64], keys: Callable[[F32], I64], dtype: np.dtype[Any], start: int, stop: int
 ) -> Iterator[Rows]:
-    """Yield the sorted rows of one part at a time, from `start` to `stop`, collected from all runs."""
-    for part in range(start, stop if runs else start):
+    """Yield the rows of each part from `start` to `stop`, sorted by key; nothing without runs.
+
+    Args:
+        spool: sorted rows of type `dtype`.
+        runs: per run, the file offsets of its parts, and of its end.
+        keys: as in `sorted_parts`.
+        dtype: type of the rows.
+        start, stop: range of parts.
+    """
+    if not runs:
+        return
+    for part in range(start, stop):
         pieces = []
         for run in runs:
             spool.seek(run[part])
@@ -501,6 +515,7 @@ def scene_of_rows(empty: SplatModel, rows: Rows) -> Scene:
 
 
 def _model_of_rows(empty: SplatModel, rows: Rows) -> SplatModel:
+    """Return a model like `empty` with the arrays of structured rows [n]."""
     arrays: dict[str, Any] = {name: np.ascontiguousarray(rows[name]) for name in ARRAYS}
     return replace(empty, **arrays)
 
@@ -527,13 +542,14 @@ class _ZCurve:
             InputError: the blocks have another number of splats than the scene.
         """
         stride = -(-scene.count // _CURVE_SAMPLE) or 1
-        samples, at = [np.zeros((0, 3), np.float32)], 0
+        samples = [np.zeros((0, 3), np.float32)]
+        count = 0
         for model in scene.blocks():
-            samples.append(model.means[-at % stride :: stride])
-            at += len(model)
+            samples.append(model.means[-count % stride :: stride])
+            count += len(model)
         sample = np.concatenate(samples)
-        if at != scene.count:
-            raise InputError(f"the scene has {at:,} splats, expected {scene.count:,}")
+        if count != scene.count:
+            raise InputError(f"the scene has {count:,} splats, expected {scene.count:,}")
         if not len(sample):
             return cls(np.zeros(3), 1.0, _SHELL_CODES)
         most = np.quantile(sample.astype(np.float64), _CURVE_QUANTILES, axis=0)

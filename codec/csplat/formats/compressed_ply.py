@@ -6,7 +6,7 @@ as in a plain PLY.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,6 +37,7 @@ from csplat.types import F32, U8, U32
 _CHUNK = 256  # splats that share bounds
 _LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger scale would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
+_COUNT_DIGITS = 18  # of a row count: it fits in 64 bits
 _BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
@@ -86,35 +87,23 @@ def _open(path: Path) -> Iterator[Scene]:
             f"{path.name}: {counted(chunk.count, 'chunk')} for {counted(vertex.count, 'splat')},"
             f" expected one per {_CHUNK}"
         )
-    kept = 0  # coefficients per channel
+    coefficient_count = 0  # per channel
     if sh is not None and not sh.dtype.names:  # gsplat writes the element without SH, too
         sh = None
     if sh is not None:
-        rest = len(sh.dtype.names or ())
-        if sh.count != vertex.count or rest not in _BANDS:
+        column_count = len(sh.dtype.names or ())
+        if sh.count != vertex.count or column_count not in _BANDS:
             raise InputError(
-                f"{path.name}: {counted(sh.count, 'row')} of {rest} SH coefficients for"
+                f"{path.name}: {counted(sh.count, 'row')} of {column_count} SH coefficients for"
                 f" {counted(vertex.count, 'splat')}, expected one row of 9, 24, 45 or 72 per splat"
             )
-        _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
-        kept = rest // 3
-    table = chunk.read(path, 0, chunk.count)
-    with np.errstate(invalid="ignore"):  # signalling NaNs are refused below
-        columns = np.stack([table[name] for name in names], 1).astype(np.float64)
-    bounds = columns.reshape(chunk.count, len(names) // 6, 2, 3)
-    bad = np.argwhere(~(np.abs(bounds) < _LARGEST_BOUND))
-    if len(bad):
-        row, kind, end, axis = bad[0]
-        raise InputError(f"{path.name}: {names[kind * 6 + end * 3 + axis]} of chunk {row} is not finite")
-    bad = np.argwhere(crossed_bounds(bounds[:, :, 0], bounds[:, :, 1]))
-    if len(bad):
-        row, kind, axis = bad[0]
-        low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
-        raise InputError(f"{path.name}: chunk {row} has {low}, expected at most {high}")
+        _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(column_count)], "u1")
+        coefficient_count = column_count // 3
+    bounds = _read_bounds(path, chunk, names)
     try:
         parsed = parse_comments(comments)
         empty = SplatModel(
-            **_unpack(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
+            **_unpack(np.zeros(0, vertex.dtype), bounds[:0], None, coefficient_count),
             origin=parsed.origin or (0.0, 0.0, 0.0),
             metadata=parsed.metadata,
         )
@@ -127,9 +116,37 @@ def _open(path: Path) -> Iterator[Scene]:
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
             chunk_bounds = bounds[start // _CHUNK : -(-stop // _CHUNK)]
-            yield replace(empty, **_unpack(words, chunk_bounds, coefficients, kept))
+            yield replace(empty, **_unpack(words, chunk_bounds, coefficients, coefficient_count))
 
     yield Scene.like(empty, vertex.count, blocks, [*findings, *parsed.findings])
+
+
+def _read_bounds(path: Path, chunk: _Element, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the bounds of the chunks, [C, kinds, 2, 3]: kind of attribute, lower and upper end, axis.
+
+    Args:
+        path: path of the file.
+        chunk: the element of the chunks.
+        names: its columns in this order, six per kind.
+
+    Raises:
+        InputError: a bound is not finite, or a lower bound is above its upper bound.
+    """
+    table = chunk.read(path, 0, chunk.count)
+    with np.errstate(invalid="ignore"):  # signalling NaNs are refused below
+        columns = np.stack([table[name] for name in names], 1).astype(np.float64)
+    bounds = columns.reshape(chunk.count, len(names) // 6, 2, 3)
+    names_of = np.reshape(names, bounds.shape[1:])
+    not_finite = np.argwhere(~(np.abs(bounds) < _LARGEST_BOUND))
+    if len(not_finite):
+        row, kind, end, axis = not_finite[0]
+        raise InputError(f"{path.name}: {names_of[kind, end, axis]} of chunk {row} is not finite")
+    crossed = np.argwhere(crossed_bounds(bounds[:, :, 0], bounds[:, :, 1]))
+    if len(crossed):
+        row, kind, axis = crossed[0]
+        low, high = (f"{names_of[kind, end, axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
+        raise InputError(f"{path.name}: chunk {row} has {low}, expected at most {high}")
+    return bounds
 
 
 def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
@@ -139,14 +156,15 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     findings = [finding for finding in findings if finding.repairable]  # row counts are checked below
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     declared: list[tuple[str, int, list[tuple[str, str]]]] = []
-    comments, form = [], ""
+    comments: list[str] = []
+    form = ""  # of the line "format"
     for line in lines[1:]:
         words = line.split()
         if words[:1] == ["comment"]:
             comments.append(line[len("comment ") :])
         elif words[:1] == ["format"]:
             form = " ".join(words[1:])
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= _COUNT_DIGITS:
             declared.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and declared:
             declared[-1][2].append((words[2], _TYPES[words[1]]))
@@ -222,30 +240,36 @@ def _between(fractions: NDArray[np.float64], bounds: NDArray[Any]) -> NDArray[np
 
 
 def _unpack_means(words: U32, bounds: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the means [N, 3] of packed words [N] and the bounds [C, 2, 3] of their chunks."""
     return _between(_split_words(words), bounds)
 
 
 def _split_words(words: U32) -> NDArray[np.float64]:
-    """Return fields of 11, 10 and 11 bits as fractions [N, 3]."""
+    """Return fields of 11, 10 and 11 bits, the first the highest, as fractions [N, 3] of their largest value."""
     return np.stack([(words >> 21) / 2047.0, (words >> 11 & 1023) / 1023.0, (words & 2047) / 2047.0], 1)
 
 
 def _sh_values() -> F32:
+    """Return the SH coefficient of each code, [256]: the middles of intervals of 1/32, but -4 and 4 at the ends."""
     values = (np.arange(256) + 0.5) / 32.0 - 4.0
     values[[0, -1]] = -4.0, 4.0
     return values.astype(np.float32)
 
 
 def _write(path: Path, scene: Scene) -> list[Finding]:
-    """Write a scene sorted along a Z curve, so that splats far from the others have chunks of their own.
+    """Write a scene sorted along a Z curve (`Format.write`), splats far from the others in chunks of their own.
 
     A splat far away would make the positions of all splats in its chunk coarse. Invisible splats fill chunks up.
+
+    Returns:
+        Findings about positions that moved, and about the invisible splats if there are any.
     """
-    rest, moved = 3 * ((scene.sh_degree + 1) ** 2 - 1), MovedSplats()
+    sh_columns = 3 * ((scene.sh_degree + 1) ** 2 - 1)
+    moved = MovedSplats()
     with atomic_writer(path, seekable=True) as stream, sorted_shells(scene, work_folder(path)) as shells:
         filling = sum(-shell.count % _CHUNK for shell in shells[:-1])
         count = scene.count + filling
-        header = _build_header(scene, count, rest)
+        header = _build_header(scene, count, sh_columns)
         sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-count // _CHUNK), 4 * len(_PACKED_COLUMNS) * count
         offsets = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
         stream.write(header)
@@ -254,8 +278,9 @@ def _write(path: Path, scene: Scene) -> list[Finding]:
                 bounds, words = _pack_words(model)
                 moved.add(model, _unpack_means(words[:, 0], bounds[:, :6].reshape(-1, 2, 3)))
                 if len(model) % _CHUNK and shell is not shells[-1]:
-                    last = words[-1:] & np.array([~0, ~0, ~0, ~255 & 0xFFFFFFFF], np.int64).astype(np.uint32)
-                    words = np.concatenate([words, np.repeat(last, -len(model) % _CHUNK, axis=0)])
+                    filler = words[-1:].copy()
+                    filler[:, 3] &= np.uint32(0xFFFFFF00)  # alpha, the lowest byte, is 0
+                    words = np.concatenate([words, np.repeat(filler, -len(model) % _CHUNK, axis=0)])
                 codes = _sh_codes(model)
                 codes = np.concatenate([codes, np.repeat(codes[-1:], len(words) - len(codes), axis=0)])
                 for index, part in enumerate((bounds.astype("<f4"), words, codes)):
@@ -287,17 +312,23 @@ def _pack_words(model: SplatModel) -> tuple[F32, U32]:
 
 
 def _sh_codes(model: SplatModel) -> U8:
+    """Return the codes [N, 3 K] of a model's SH coefficients, channel by channel; values outside ±4 are clamped."""
     codes: U8 = np.floor(model.shN.transpose(0, 2, 1) * np.float32(32) + np.float32(128)).clip(0, 255).astype(np.uint8)
     return codes
 
 
 def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
-    """Pack three columns into the upper bits of words; also return the lower and upper chunk bounds, [C, 3] each."""
+    """Pack the columns of values [N, 3] into words [N], the first in the highest of their `bits`.
+
+    Returns:
+        The words, whose other bits are 0; and the lower and upper bounds of each chunk, [C, 3] each.
+    """
     count = len(values)
     starts = np.arange(0, count, _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     span = (high.astype(np.float64) - low).clip(min=np.finfo(np.float32).tiny)
-    words, shift = np.zeros(count, np.uint32), 32
+    words = np.zeros(count, np.uint32)
+    shift = 32  # bits below the columns packed so far
     for axis, width in enumerate(bits):
         scale = ((1 << width) - 1) / span[:, axis]
         share = (values[:, axis] - np.repeat(low[:, axis].astype(np.float64), _CHUNK)[:count]) * np.repeat(
@@ -308,8 +339,8 @@ def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
     return words, low, high
 
 
-def _build_header(scene: Scene, count: int, rest: int) -> bytes:
-    """Return the header; `rest` is the number of SH columns, 0 without an element for SH."""
+def _build_header(scene: Scene, count: int, sh_columns: int) -> bytes:
+    """Return the header for `count` splats, filling included; without SH columns, there is no element for SH."""
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -317,8 +348,8 @@ def _build_header(scene: Scene, count: int, rest: int) -> bytes:
     ]
     lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED_COLUMNS)]
-    if rest:
-        lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))]
+    if sh_columns:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(sh_columns))]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")
 
 

@@ -30,10 +30,11 @@ Rows = NDArray[Any]
 
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
-_HEADER_SIZE, _SECTION_SIZE = 4096, 1024
+_HEADER_SIZE, _SECTION_SIZE = 4096, 1024  # bytes; the headers of all sections follow that of the file
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
 _COEFFICIENTS = (0, 9, 24)  # number of SH coefficients, by degree
-_CENTRE_SIZE = 12
+_CENTRE_SIZE = 12  # bytes of a bucket's centre, three float32
+_POSITION_MAX = 65535  # largest position of 16 bits
 _DEFAULT_SPAN = 32767  # position units from the centre of a block to its faces
 _DEFAULT_SH = 1.5  # SH bytes represent -1.5 to 1.5
 _LARGEST = 1e38  # larger values exceed float32
@@ -90,7 +91,7 @@ def _open(path: Path) -> Iterator[Scene]:
     data = map_file(path)
     if len(data) < _HEADER_SIZE:
         raise InputError(f"{path.name} is truncated: it ends within its header")
-    major, minor, most, _, _, count, level, low, high = _HEADER.unpack_from(data)
+    major, minor, section_count, _, _, count, level, low, high = _HEADER.unpack_from(data)
     if (major, minor) != (0, 1):
         raise InputError(f"{path.name} is .ksplat of version {major}.{minor}, expected 0.1")
     if level >= len(_TYPES):
@@ -98,7 +99,7 @@ def _open(path: Path) -> Iterator[Scene]:
     low, high = low or -_DEFAULT_SH, high or _DEFAULT_SH
     if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
         raise InputError(f"{path.name} has SH from {low} to {high}, expected finite numbers, the larger one last")
-    sections, end = _sections(path.name, data, level, most)
+    sections, end = _read_sections(path.name, data, level, section_count)
     total = sum(len(section.rows) for section in sections)
     if total != count:
         raise InputError(f"{path.name} has {total:,} splats in its sections, its header declares {count:,}")
@@ -139,13 +140,17 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
     )
 
 
-def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
-    """Return the sections and the offset after the last section."""
+def _read_sections(name: str, data: Any, level: int, section_count: int) -> tuple[list[_Section], int]:
+    """Return the sections and the offset after the last one.
+
+    Raises:
+        InputError: a section does not fit into the file, or contradicts itself.
+    """
     sections: list[_Section] = []
-    at = _HEADER_SIZE + most * _SECTION_SIZE
+    at = _HEADER_SIZE + section_count * _SECTION_SIZE
     if at > len(data):
-        raise InputError(f"{name} declares {most:,} sections, too many for its {len(data):,} bytes")
-    for index in range(most):
+        raise InputError(f"{name} declares {section_count:,} sections, too many for its {len(data):,} bytes")
+    for index in range(section_count):
         head = _SectionHead(*_SECTION.unpack_from(data, _HEADER_SIZE + index * _SECTION_SIZE))
         where = f"{name}, section {index}"
         if head.degree >= len(_COEFFICIENTS):
@@ -160,14 +165,24 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
             raise InputError(f"{where}: {head.splats:,} splats, but space for {head.capacity:,}")
         rows = np.frombuffer(data, row, head.splats, start)
         if level and head.splats:
-            sections.append(_Section(rows, *_buckets(where, data, head, centres)))
+            sections.append(_Section(rows, *_read_buckets(where, data, head, centres)))
         else:
             sections.append(_Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0))
     return sections, at
 
 
-def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
-    """Return `ends` [B], `corners` [B, 3] and `step` of a `_Section`; partial buckets' lengths precede the centres."""
+def _read_buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
+    """Return `ends` [B], `corners` [B, 3] and `step` of a `_Section`.
+
+    Args:
+        where: file and section, for messages.
+        data: the file.
+        head: header of the section.
+        centres: file offset of the bucket centres, which follow the lengths of the partial buckets.
+
+    Raises:
+        InputError: the buckets contradict the header, or hold too few splats, or a centre is not finite.
+    """
     if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
         raise InputError(
             f"{where}: {head.full:,} full and {head.partial:,} partial buckets, expected {head.buckets:,} together"
@@ -181,7 +196,7 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
     if head.block < 0:
         raise InputError(f"{where}: the length of its blocks is {head.block:g}, expected at least 0")
     step = head.block / 2 / span
-    if not (np.abs(middles) + 65535 * abs(step) < _LARGEST).all():
+    if not (np.abs(middles) + _POSITION_MAX * abs(step) < _LARGEST).all():
         raise InputError(f"{where}: its bucket centres are not finite")
     return ends, middles - span * step, step
 

@@ -28,7 +28,7 @@ from csplat.types import F32
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 _LARGEST_LOG = np.float32(88.0)  # its exponential fits in float32
 _QUAT_ZERO = 128  # byte of a component of 0; 1 would be 256
-_SAMPLE = 4096  # number of splats that `_doubt` checks
+_SAMPLE = 4096  # number of splats that `_doubt_rows` checks
 #: Plausible largest coordinates other than 0, scene units; a quarter of random bytes is inside.
 _COORDINATES = (1e-12, 1e12)
 _LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 have length 256
@@ -51,7 +51,7 @@ def _open(path: Path) -> Iterator[Scene]:
     yield finite_scene(blocks, _decode_rows, _decode_rows(np.zeros((0, 3), np.float32), rows[:0]), zero_quat=_QUAT_ZERO)
 
 
-def _doubt(path: Path) -> str:
+def _doubt_rows(path: Path) -> str:
     """Return the reason why a file is unlikely to contain splats (`Format.doubt`): most of a sample is implausible."""
     data = map_file(path)
     if len(data) % _ROW.itemsize or not len(data):
@@ -62,19 +62,19 @@ def _doubt(path: Path) -> str:
     share = np.mean(_PRINTABLE[np.frombuffer(sample.tobytes(), np.uint8)])
     if share >= _MOST_IS_TEXT:
         return f"it is text, and begins with {bytes(data[:24]).decode('ascii', 'replace')!a}"
-    far = np.abs(sample["means"]).max(axis=1)  # NaN if a coordinate is NaN
-    placed = (far == 0) | ((far > _COORDINATES[0]) & (far < _COORDINATES[1]))
+    reach = np.abs(sample["means"]).max(axis=1)  # NaN if a coordinate is NaN
+    is_placed = (reach == 0) | ((reach > _COORDINATES[0]) & (reach < _COORDINATES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
-    rotated = lengths < _LONGEST_QUAT
+    is_rotated = lengths < _LONGEST_QUAT
     has_both_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
-    finite = np.isfinite(far)  # findings report the other rows
-    good = ~finite | (placed & rotated & ~has_both_signs)
-    if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
+    finite = np.isfinite(reach)  # findings report the other rows
+    good = ~finite | (is_placed & is_rotated & ~has_both_signs)
+    if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):  # at most half
         return ""
-    worst = int(np.argmin(good))
+    worst = int(np.argmin(good))  # the first that is implausible
     name, verb = ("means", "is at")
-    if placed[worst]:
-        name, verb = ("scales", "has scales of") if rotated[worst] else ("quats", "has a rotation of the bytes")
+    if is_placed[worst]:
+        name, verb = ("scales", "has scales of") if is_rotated[worst] else ("quats", "has a rotation of the bytes")
     values = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
     share = np.count_nonzero(~good) / np.count_nonzero(finite)
     at = worst * step * _ROW.itemsize
@@ -115,7 +115,7 @@ FORMAT = Format(
     name="splat",
     open=_open,
     write=_write,
-    doubt=_doubt,
+    doubt=_doubt_rows,
     degree=0,
     ranges={
         "scales": ValueRange(LOG_OF_0, float(_LARGEST_LOG)),

@@ -173,8 +173,12 @@ def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
 
 
 def _read_arrays(packed: SpzArrays, _size: int, stream: BinaryIO) -> None:
-    """Read versions 1 to 3: all attributes in turn, then extensions."""
-    _fill(packed.name, stream, packed.allocate()[_HEADER.size :])
+    """Read versions 1 to 3 after the header into `parts` of `packed`, and the extensions that follow.
+
+    Raises:
+        InputError: the stream ends early, or too many bytes follow the attributes.
+    """
+    _read_into(packed.name, stream, packed.allocate()[_HEADER.size :])
     tail = stream.read(_EXTENSION_BYTES + 1)  # up to the end, where gzip verifies its checksum
     if len(tail) > _EXTENSION_BYTES:
         raise InputError(f"{packed.name} has more than {_EXTENSION_BYTES:,} bytes after its last splat")
@@ -182,7 +186,13 @@ def _read_arrays(packed: SpzArrays, _size: int, stream: BinaryIO) -> None:
 
 
 def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
-    """Read version 4: extensions, a table, then a stream for each attribute that is not empty."""
+    """Read version 4 after its header: extensions, a table, then a stream for each attribute that is not empty.
+
+    Sets `axes` and `parts` of `packed`; `size` is the size of the file in bytes.
+
+    Raises:
+        InputError: the file is truncated, or its table contradicts the header or the size.
+    """
     (table,) = _HEADER_REST.unpack(_read_exactly(packed.name, stream, _HEADER_REST.size))
     start = _HEADER.size + _HEADER_REST.size
     if not start <= table <= start + _EXTENSION_BYTES:
@@ -191,10 +201,10 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
         )
     _read_extensions(packed, _read_exactly(packed.name, stream, table - start))
     sizes = [packed.count * width for width in packed.widths]
-    unpacked = [size for size in sizes if size]
+    stream_sizes = [part_size for part_size in sizes if part_size]
     rows = [_STREAM.unpack(_read_exactly(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
-    if [row[1] for row in rows] != unpacked:
-        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, expected {unpacked}")
+    if [row[1] for row in rows] != stream_sizes:
+        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, expected {stream_sizes}")
     declared_size = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
     if declared_size != size:
         raise InputError(f"{packed.name} has {size:,} bytes, its table declares {declared_size:,}")
@@ -202,16 +212,16 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
     for part_size, width in zip(sizes, packed.widths, strict=True):
         data = np.empty(part_size, np.uint8)
         if part_size:
-            whole = _read_exactly(packed.name, stream, next(row_iterator)[0])
-            with zstandard.ZstdDecompressor().stream_reader(whole, read_across_frames=True) as reader:
-                _fill(packed.name, reader, data)
+            coded = _read_exactly(packed.name, stream, next(row_iterator)[0])
+            with zstandard.ZstdDecompressor().stream_reader(coded, read_across_frames=True) as reader:
+                _read_into(packed.name, reader, data)
                 if reader.read(1):
                     raise InputError(f"{packed.name} has a stream that unpacks to more than {part_size:,} bytes")
         packed.parts.append(data.reshape(packed.count, width))
 
 
 def _read_extensions(packed: SpzArrays, data: bytes) -> int:
-    """Read the axes, skip other extensions, and return the size of all extensions in bytes."""
+    """Set `axes` of `packed`, skip other extensions, and return the size of all extensions in bytes."""
     at = 0
     while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
         kind, size = _RECORD.unpack_from(data, at)
@@ -233,7 +243,7 @@ def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
     return data
 
 
-def _fill(name: str, stream: Any, data: U8) -> None:
+def _read_into(name: str, stream: Any, data: U8) -> None:
     """Read as many bytes as `data` has into it; raise an `InputError` if the stream ends before."""
     at = 0
     while at < len(data):
@@ -244,9 +254,11 @@ def _fill(name: str, stream: Any, data: U8) -> None:
 
 
 _COLOUR = np.float32(0.15)  # colour per unit of an SH coefficient of degree 0
-_PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # quantisation step of a quaternion component
+_MAGNITUDE_MAX, _SIGN = 511, 512  # the nine lower bits of a quaternion component, and its sign bit
+_PART = np.sqrt(np.float32(0.5)) / np.float32(_MAGNITUDE_MAX)  # quantisation step of a quaternion component
 _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
+_SMALL_REACH = 2**-8  # scene units; positions up to this fit with `MAX_FRACTION_BITS`
 _STEPS = 32  # minimum number of position steps within the median standard deviation
 _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
@@ -331,13 +343,17 @@ def _decode_rotations(rotations: U8) -> F32:
     """Decode [N, 4] bytes to wxyz: three smallest in ten bits each, sign and magnitude, the first in the highest."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
-    sizes = fields & 511
-    xyzw = decode_smallest_three(words >> np.uint32(30), np.where(fields & 512, -sizes, sizes) * _PART)
+    sizes = fields & _MAGNITUDE_MAX
+    xyzw = decode_smallest_three(words >> np.uint32(30), np.where(fields & _SIGN, -sizes, sizes) * _PART)
     return xyzw[:, [3, 0, 1, 2]]
 
 
 def _choose_fraction_bits(path: Path, scene: Scene) -> int:
-    """Choose the number of fractional bits of positions: enough for the median splat, limited by the scene's extent."""
+    """Choose the number of fractional bits of positions: enough for the median splat, limited by the scene's extent.
+
+    Raises:
+        InputError: a position exceeds the range of SPZ.
+    """
     reach, scales = 0.0, np.zeros(256, np.int64)
     for block in scene.blocks():
         reach = max(reach, float(np.abs(block.means).max(initial=0.0)))
@@ -348,8 +364,9 @@ def _choose_fraction_bits(path: Path, scene: Scene) -> int:
             " --drop-floaters drops splats far from all others, or write another format"
         )
     middle = int(np.searchsorted(np.cumsum(scales), scales.sum() / 2))
-    fine = math.ceil(math.log2(_STEPS) - (middle / 16 - 10) / math.log(2))
-    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MAX_FRACTION_BITS
+    median_log = middle / 16 - 10  # the inverse of `_scale_codes`
+    fine = math.ceil(math.log2(_STEPS) - median_log / math.log(2))
+    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > _SMALL_REACH else MAX_FRACTION_BITS
     return min(max(fine, _USUAL_BITS), fitting)
 
 
@@ -368,6 +385,7 @@ def _encode_block(model: SplatModel, bits: int) -> tuple[U8, ...]:
 
 
 def _scale_codes(scales: F32) -> U8:
+    """Encode log scales in steps of 1/16 from -10, clamped to bytes."""
     return round_to_bytes(scales * np.float32(16) + np.float32(160))
 
 
@@ -375,7 +393,8 @@ def _encode_rotations(quats: F32) -> U8:
     """Invert `_decode_rotations`: quats [N, 4] to bytes [N, 4]."""
     largest, three = encode_smallest_three(quats[:, [1, 2, 3, 0]])
     steps = np.rint(three / _PART)
-    fields = np.minimum(np.abs(steps), 511).astype(np.uint32) | np.where(steps < 0, np.uint32(512), np.uint32(0))
+    signs = np.where(steps < 0, np.uint32(_SIGN), np.uint32(0))
+    fields = np.minimum(np.abs(steps), _MAGNITUDE_MAX).astype(np.uint32) | signs
     words: NDArray[np.uint32] = largest.astype("<u4") << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
     return words[:, None].view(np.uint8)
 

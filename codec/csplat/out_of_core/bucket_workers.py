@@ -106,15 +106,24 @@ def open_client(scheduler: str) -> Any:
 
 
 def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:
-    """Code a bucket unless it is already coded."""
+    """Encode a bucket, and write the file of the coded bucket (see the module), unless that file exists.
+
+    With levels of detail, also writes the file at `roots_path`.
+
+    Raises:
+        InputError: a value does not fit on the lattice, or the spill file is damaged.
+        OSError: a file cannot be read or written.
+    """
     path = coded_path(coding.folder, bucket)
     if path.exists():  # by a worker that Dask lost
         return
     encoded = _encode_bucket(coding, bucket)
-    records, payloads, size = list[dict[str, Any]](), list[bytes](), 0
-    nodes = encoded.nodes or [FileNode(None, [part.tile for part in encoded.tiles])]
-    parts = iter(encoded.tiles)
-    for tile in (tile for node in nodes for tile in node.tiles):
+    nodes = encoded.nodes or [FileNode(None, [leaf.tile for leaf in encoded.tiles])]
+    leaves = iter(encoded.tiles)  # the tiles of level 0, in the order in which `nodes` has them
+    records = list[dict[str, Any]]()
+    payloads = list[bytes]()
+    size = 0  # bytes of the payloads so far, the offset of the next
+    for tile in [tile for node in nodes for tile in node.tiles]:
         layers = {}
         for layer, payload in tile.layers.items():
             assert isinstance(payload, bytes)
@@ -123,8 +132,8 @@ def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:
             size += len(payload)
         record: dict[str, Any] = {"tile": {**asdict(replace(tile, layers={})), "layers": layers}}
         if tile.level == 0:
-            part = next(parts)
-            record |= {"errors": asdict(part.errors), "coarsened": sorted(part.coarsened)}
+            leaf = next(leaves)
+            record |= {"errors": asdict(leaf.errors), "coarsened": sorted(leaf.coarsened)}
         records.append(record)
     tree = [[node.parent, len(node.tiles), node.error, node.squares] for node in nodes]
     text = json.dumps({"tiles": records, "nodes": tree}).encode()
@@ -134,7 +143,14 @@ def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:
 
 
 def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
-    """Encode a bucket, with its levels of detail and their errors if there are any; write its coarsest nodes."""
+    """Read a bucket from its spill file, and encode it with the parameters and codebooks of the scene.
+
+    With levels of detail, builds and measures the levels of the bucket, and writes the splats of its coarsest nodes to
+    the file at `roots_path`.
+
+    Returns:
+        The tiles, whose errors are of this bucket alone, and the nodes, none without levels of detail.
+    """
     model = clip_scales(read_bucket(coding.folder, coding.plan.model, bucket))
     context = coding.plan.context
     plan = replace(coding.plan, model=model, origin=Origin(len(model), np.arange(len(model))))
@@ -166,23 +182,26 @@ def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[Fi
     for record in content["tiles"]:
         fields = record["tile"]
         layers = {
-            int(layer): LazyPayload(length, check, partial(_read_payload, path, _HEAD.size + size + at, length, check))
-            for layer, (at, length, check) in fields.pop("layers").items()
+            int(layer): LazyPayload(
+                length, payload_crc, partial(_read_payload, path, _HEAD.size + size + offset, length, payload_crc)
+            )
+            for layer, (offset, length, payload_crc) in fields.pop("layers").items()
         }
         fields |= {name: tuple(fields[name]) for name in ("corner", "extent", "codebook_ids")}
         tiles.append(FileTile(layers=layers, **fields))
         if "errors" in record:
             errors, coarsened = ErrorSums(**record["errors"]), frozenset(record["coarsened"])
             leaves.append(EncodedTile(tiles[-1], np.zeros(0, np.intp), errors, coarsened))
-    rest = iter(tiles)
+    remaining_tiles = iter(tiles)
     nodes = [
-        FileNode(parent, [next(rest) for _ in range(count)], error, tuple(squares))
+        FileNode(parent, [next(remaining_tiles) for _ in range(count)], error, tuple(squares))
         for parent, count, error, squares in content["nodes"]
     ]
     return leaves, nodes
 
 
 def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:
+    """Read `size` bytes at `offset`; raise an `InputError` if some are missing or the CRC of their chunk differs."""
     with open_binary(path) as stream:
         stream.seek(offset)
         data = stream.read(size)

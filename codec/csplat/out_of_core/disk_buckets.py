@@ -145,7 +145,7 @@ class DiskBuckets:
             OSError: it cannot be read.
         """
         count = len(sample_rows(sum(self.counts), self.bucket_splats))
-        return SceneSurvey(_read(self.folder / _SAMPLE, self.model, 0, count), self.largest_sh, self.contrast)
+        return SceneSurvey(_read_range(self.folder / _SAMPLE, self.model, 0, count), self.largest_sh, self.contrast)
 
     def remove_section(self, section: int) -> None:
         """Remove a spill file whose buckets are coded."""
@@ -169,7 +169,7 @@ def read_bucket(folder: Path, model: SplatModel, bucket: Bucket) -> SplatModel:
         InputError: the file is damaged.
         OSError: the file cannot be read.
     """
-    return _read(_section_path(folder, bucket.section), model, bucket.start, bucket.stop)
+    return _read_range(_section_path(folder, bucket.section), model, bucket.start, bucket.stop)
 
 
 def write_splats(path: Path, model: SplatModel) -> None:
@@ -194,7 +194,7 @@ def read_splats(path: Path, model: SplatModel, count: int) -> SplatModel:
         InputError: the file is damaged.
         OSError: it cannot be read.
     """
-    return _read(path, model, 0, count)
+    return _read_range(path, model, 0, count)
 
 
 def splat_bytes(model: SplatModel) -> int:
@@ -208,7 +208,19 @@ def damaged_file(path: Path) -> InputError:
 
 
 def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
-    """Return `_STATE_FIELDS` from the folder; `None` if its scene is not sorted yet."""
+    """Read the state file of a working folder.
+
+    Args:
+        folder: the folder, which need not exist.
+        key: identity of scene and options, with which the folder must have been started.
+        resume: False refuses a folder that has a state file.
+
+    Returns:
+        `_STATE_FIELDS` by name; `None` if the scene is not sorted yet, or the folder is empty or does not exist.
+
+    Raises:
+        InputError: the folder has other content, may not be continued, has another key, or is damaged.
+    """
     path = folder / _STATE
     if not path.exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -227,18 +239,22 @@ def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str,
                 f"{folder} was started with {name} {previous.get(name)}, now {value}: continue with the former {name}, "
                 "or remove the folder to start again"
             )
-    if state and tuple(state) != _STATE_FIELDS:  # another version's
+    if state and tuple(state) != _STATE_FIELDS:
         raise damaged_file(path)
     return state or None
 
 
 def _write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON; an existing file is replaced when the new one is complete."""
     with atomic_writer(path) as stream:
         stream.write(json.dumps(value).encode())
 
 
 def _sort(scene: Scene, folder: Path, bucket_splats: int, progress: Progress) -> DiskBuckets:
-    """Read the scene twice: survey it, then sort its splats into spill files."""
+    """Read the scene twice: survey it, then sort its splats into spill files; write both to `folder`, which exists.
+
+    The contrast is measured at the end, on a few of the sorted buckets, because it requires neighbouring splats.
+    """
     curve, largest = _survey(scene.with_progress("looking", progress), folder, bucket_splats)
     counts = _spill(scene.with_progress("sorting", progress), folder, curve)
     store = DiskBuckets(folder, scene.empty(), bucket_splats, counts, largest, 0.0)
@@ -247,12 +263,17 @@ def _sort(scene: Scene, folder: Path, bucket_splats: int, progress: Progress) ->
 
 
 def _survey(scene: Scene, folder: Path, bucket_splats: int) -> tuple[BucketCurve, float]:
-    """Write the sample; return the curve through it and the largest magnitude of all SH coefficients."""
-    rows, largest = sample_rows(scene.count, bucket_splats), 0.0
+    """Read the scene once, and write its sample to the file `_SAMPLE` of the folder.
+
+    Returns:
+        The bucket curve through the sample; the largest magnitude of all SH coefficients of the scene.
+    """
+    rows = sample_rows(scene.count, bucket_splats)
+    largest = 0.0
     sample = np.empty(len(rows), _record_type(scene.empty()))
-    for where, block in scene.numbered():
-        first, last = np.searchsorted(rows, (where.start, where.stop))
-        sample[first:last] = _records(block, rows[first:last] - where.start, sample.dtype)
+    for span, block in scene.numbered():
+        first, last = np.searchsorted(rows, (span.start, span.stop))  # the part of the sample in this block
+        sample[first:last] = _records(block, rows[first:last] - span.start, sample.dtype)
         largest = max(largest, largest_sh(block.shN))
     with open_binary(folder / _SAMPLE, "w") as stream:
         _write_frames(stream, sample)
@@ -260,12 +281,20 @@ def _survey(scene: Scene, folder: Path, bucket_splats: int) -> tuple[BucketCurve
 
 
 def _spill(scene: Scene, folder: Path, curve: BucketCurve) -> list[int]:
-    """Write all splats to spill files, each in the scene's order; return the number of splats in each."""
-    dtype, counts = _record_type(scene.empty()), np.zeros(curve.count, np.int64)
-    pending: list[list[Records]] = [[] for _ in range(curve.count)]
+    """Read the scene once, and append each splat to the spill file of its section, in the scene's order.
+
+    At most `PENDING_BYTES` of splats, or one block, wait in memory; each flush appends to every section that has some.
+
+    Returns:
+        The number of splats in each section, 0 for a section without a file.
+    """
+    dtype = _record_type(scene.empty())
+    counts = np.zeros(curve.count, np.int64)
+    pending: list[list[Records]] = [[] for _ in range(curve.count)]  # by section
     pending_bytes = 0
 
     def flush() -> None:
+        """Append the pending records to their files, and empty `pending`."""
         for section, parts in enumerate(pending):
             if parts:
                 _append(_section_path(folder, section), np.concatenate(parts))
@@ -289,11 +318,12 @@ def _spill(scene: Scene, folder: Path, curve: BucketCurve) -> list[int]:
 
 
 def _section_path(folder: Path, section: int) -> Path:
+    """Return the path of the spill file of a section."""
     return folder / f"section-{section:06}"
 
 
 def _arrays(model: SplatModel) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a model by the name of their field in a record."""
+    """Return the arrays of a model, [N, ...], by the name of their field in a record; extra columns have a prefix."""
     doubles = {} if model.means_double is None else {"means_double": model.means_double}
     return {
         **{name: getattr(model, name) for name in _ARRAYS},
@@ -303,26 +333,29 @@ def _arrays(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 
 def _record_type(model: SplatModel) -> np.dtype[np.void]:
+    """Return the type of a record: all values of one splat of a model, which may be without splats."""
     return np.dtype([(name, array.dtype, array.shape[1:]) for name, array in _arrays(model).items()])
 
 
 def _records(model: SplatModel, rows: NDArray[Any], dtype: np.dtype[Any]) -> Records:
-    """Return records of some splats, without extra columns that the type does not have."""
-    records, arrays = np.empty(len(rows), dtype), _arrays(model)
+    """Return records, [n], of the splats `rows` [n], without extra columns that the type does not have."""
+    records = np.empty(len(rows), dtype)
+    arrays = _arrays(model)
     for start in range(0, len(rows), _FRAME_SPLATS):
-        part, chosen = records[start : start + _FRAME_SPLATS], rows[start : start + _FRAME_SPLATS]
+        part = slice(start, start + _FRAME_SPLATS)
         for name in dtype.names or ():
-            part[name] = np.take(arrays[name], chosen, axis=0)
+            records[part][name] = np.take(arrays[name], rows[part], axis=0)
     return records
 
 
 def _append(path: Path, records: Records) -> None:
+    """Append records to a spill file as frames; the file is made if it does not exist."""
     with open_binary(path, "a") as stream:
         _write_frames(stream, records)
 
 
 def _write_frames(stream: BinaryIO, records: Records) -> None:
-    """Write frames of at most `_FRAME_SPLATS` splats."""
+    """Write records as frames of at most `_FRAME_SPLATS` splats; none for no records."""
     for start in range(0, len(records), _FRAME_SPLATS):
         data = records[start : start + _FRAME_SPLATS].view(np.uint8).data
         stream.write(_FRAME.pack(len(data) // records.itemsize, zlib.crc32(data)))
@@ -330,14 +363,21 @@ def _write_frames(stream: BinaryIO, records: Records) -> None:
 
 
 def _frames(path: Path, dtype: np.dtype[Any]) -> Iterator[Records]:
-    """Yield the records of each frame of a file."""
-    left = path.stat().st_size
+    """Yield the records of each frame of a file, in their order.
+
+    Raises:
+        InputError: a frame is cut off, or its CRC differs.
+        OSError: the file cannot be read.
+    """
+    remaining_bytes = path.stat().st_size
     with open_binary(path) as stream:
-        while left:
+        while remaining_bytes:
             head = stream.read(_FRAME.size)
-            count, crc = _FRAME.unpack(head) if len(head) == _FRAME.size else (left, 0)
-            left -= _FRAME.size + count * dtype.itemsize
-            if left < 0:
+            if len(head) < _FRAME.size:
+                raise damaged_file(path)
+            count, crc = _FRAME.unpack(head)
+            remaining_bytes -= _FRAME.size + count * dtype.itemsize
+            if remaining_bytes < 0:  # before `count` is used to allocate
                 raise damaged_file(path)
             records = np.empty(count, dtype)
             data = records.view(np.uint8).data
@@ -346,19 +386,31 @@ def _frames(path: Path, dtype: np.dtype[Any]) -> Iterator[Records]:
             yield records
 
 
-def _read(path: Path, model: SplatModel, start: int, stop: int) -> SplatModel:
-    """Read a range of the splats of a file."""
-    dtype, at, read = _record_type(model), 0, 0
+def _read_range(path: Path, model: SplatModel, start: int, stop: int) -> SplatModel:
+    """Read the splats `start` to `stop` - 1 of a file.
+
+    Args:
+        path: the file, a sequence of frames, which are read and checked up to `stop`.
+        model: a scene with the arrays of the file, whose metadata is returned.
+        start, stop: the range, splats.
+
+    Raises:
+        InputError: the file is damaged or has fewer than `stop` splats.
+        OSError: it cannot be read.
+    """
+    frame_start = 0  # index in the file of the frame's first splat
+    filled = 0  # splats read so far
     arrays: dict[str, Any] = {
         name: np.empty((stop - start, *array.shape[1:]), array.dtype) for name, array in _arrays(model).items()
     }
-    for frame in _frames(path, dtype):
-        records = frame[max(0, start - at) : max(0, stop - at)]
+    for frame in _frames(path, _record_type(model)):
+        records = frame[max(0, start - frame_start) : max(0, stop - frame_start)]
         for name, array in arrays.items():
-            array[read : read + len(records)] = records[name]
-        at, read = at + len(frame), read + len(records)
-        if at >= stop:
+            array[filled : filled + len(records)] = records[name]
+        frame_start += len(frame)
+        filled += len(records)
+        if frame_start >= stop:
             break
-    if read < stop - start:
+    if filled < stop - start:
         raise damaged_file(path)
     return replace(model, extra={name: arrays.pop(f"extra {name}") for name in model.extra}, **arrays)

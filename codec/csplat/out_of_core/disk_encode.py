@@ -40,6 +40,8 @@ _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20
 # arrays, and bytes per splat. Size of the file relative to a file without levels.
 _LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
 _LEVEL_SIZE = 1.35
+_DISK_PASSES = 4  # time for surveying, sorting and reading buckets, in reading passes over the scene
+_CODEBOOK_SPLATS = 500_000  # splats from which a codebook takes its full time; fewer take proportionally less
 _NAME_BYTES_MAX = 250  # bytes of a file's name with which `.work` fits into the 255 of file systems
 _NAME_PART = 60  # characters of a longer name that are kept: at most 240 bytes
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
@@ -110,19 +112,23 @@ def estimate_cost(
     resumes = context.resume and out is not None and working_folder(context, out).exists()
     row = splat_bytes(_with_written_columns(scene, options).empty())
     processes = context.workers if isinstance(context.workers, int) else context.thread_count
-    workers, passes, disk = context.thread_count, 1, int(count * row * _CODED)
+    workers = context.thread_count
+    passes = 1
+    disk = int(count * row * _CODED)
     per_bucket = min(count, options.bucket_splats)
-    is_one = count <= (options.bucket_splats if levels is None else levels.whole_splats)
-    building = 0 if levels is None else _building_bytes(count if is_one else per_bucket, row)
+    is_whole = count <= (options.bucket_splats if levels is None else levels.whole_splats)
+    building = 0 if levels is None else _building_bytes(count if is_whole else per_bucket, row)
     memory = least = _PROGRAM + int(count * row * _WHOLE_ROW) + building
     # Building levels takes most of the time, and processes share it better than threads.
-    in_memory = is_one or (levels is None and memory <= bound and context.workers is None and not resumes)
+    in_memory = is_whole or (levels is None and memory <= bound and context.workers is None and not resumes)
     if not in_memory:
         if options.shape_codebook_size:
             raise InputError(f"a codebook of shapes requires the scene in memory, about {memory / _MB:,.0f} MB")
         worker = _PROGRAM + int(per_bucket * row * _PER_ROW) + building
         memory = least = worker + PENDING_BYTES
-        workers, passes, disk = max(1, min(processes, (bound - _PROGRAM) // worker)), 4, disk + count * row
+        workers = max(1, min(processes, (bound - _PROGRAM) // worker))
+        passes = _DISK_PASSES
+        disk += count * row
         if workers > 1:
             memory = max(memory, _PROGRAM + workers * worker)
     if least > bound and not (in_memory and context.memory is None):
@@ -130,16 +136,21 @@ def estimate_cost(
             f"{bound / _MB:,.0f} MB of memory are too little for this scene, which requires {least / _MB:,.0f} MB"
         )
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
-    seconds = count / 1e6 * (read * passes + code / workers) + book * min(1.0, count / 5e5) / workers
+    seconds = count / 1e6 * (read * passes + code / workers) + book * min(1.0, count / _CODEBOOK_SPLATS) / workers
     file_bytes = round(count * _FILE_BYTES[options.preset][degree])
     if levels is not None:
-        seconds += levels.seconds(count) / (1 if is_one else workers)
+        seconds += levels.seconds(count) / (1 if is_whole else workers)
         file_bytes = round(file_bytes * _LEVEL_SIZE)
     return EncodingCost(count, degree, in_memory, workers, memory, disk, seconds, file_bytes)
 
 
 def _building_bytes(count: int, row: int) -> int:
-    """Return the memory for building the levels of some splats together, in addition to encoding them."""
+    """Return the memory, bytes, for building the levels of `count` splats together, in addition to encoding them.
+
+    Args:
+        count: number of splats.
+        row: size of the arrays of a splat, bytes.
+    """
     return _LEVEL_RENDERS + int(count * (row * _LEVEL_ROWS + _LEVEL_SPLAT))
 
 
@@ -199,31 +210,39 @@ def _encode_buckets(
     Args:
         store: the sorted scene.
         options, levels: as in `encode_on_disk`.
-        context: as in `encode_on_disk`; it has a worker for each process.
+        context: as in `encode_on_disk`; its `workers` are the number of processes, or the address of a scheduler.
+
+    Returns:
+        The tiles of the scene, whose payloads are read when the file is written; the nodes if there are levels. The
+        spill files are removed as their buckets are coded, the files of coded buckets stay in the working folder.
+
+    Raises:
+        InputError, OSError: as in `code_buckets` and `read_coded`.
     """
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))
     plan, codebooks = EncodePlan.of_buckets(store, options, origin, context).choose_sh_coding()
-    left = [bucket for bucket in buckets if not coded_path(store.folder, bucket).exists()]
-    uncoded = Counter(bucket.section for bucket in left)
-    for section in set(range(len(store.counts))) - set(uncoded):
+    uncoded = [bucket for bucket in buckets if not coded_path(store.folder, bucket).exists()]
+    uncoded_by_section = Counter(bucket.section for bucket in uncoded)
+    for section in set(range(len(store.counts))) - set(uncoded_by_section):
         store.remove_section(section)
-    done = count - sum(bucket.stop - bucket.start for bucket in left)
+    done = count - sum(bucket.stop - bucket.start for bucket in uncoded)  # splats
     # A context that worker processes receive has no progress callback.
-    alone = Context(threads=context.threads if context.workers == 1 else 1, seed=context.seed)
-    coding = BucketCoding(store.folder, replace(plan, context=alone), codebooks, levels)
-    for bucket in code_buckets(coding, left, context.workers or 1):
-        uncoded[bucket.section] -= 1
-        if not uncoded[bucket.section]:
+    worker_context = Context(threads=context.threads if context.workers == 1 else 1, seed=context.seed)
+    coding = BucketCoding(store.folder, replace(plan, context=worker_context), codebooks, levels)
+    for bucket in code_buckets(coding, uncoded, context.workers or 1):
+        uncoded_by_section[bucket.section] -= 1
+        if not uncoded_by_section[bucket.section]:
             store.remove_section(bucket.section)
         done += bucket.stop - bucket.start
         context.progress("coding", done / count)
-    tiles, nodes, roots = list[EncodedTile](), list[FileNode](), list[list[int]]()
+    tiles, nodes = list[EncodedTile](), list[FileNode]()
+    roots = list[list[int]]()  # by bucket: indices in `nodes` of its coarsest nodes
     for bucket in buckets:
-        leaves, part = read_coded(store.folder, bucket)
+        leaves, bucket_nodes = read_coded(store.folder, bucket)
         tiles += leaves
-        roots.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
-        nodes += [_renumbered(node, len(nodes)) for node in part]
+        roots.append([len(nodes) + number for number, node in enumerate(bucket_nodes) if node.parent is None])
+        nodes += [_renumbered(node, len(nodes)) for node in bucket_nodes]
     encoded = EncodedTiles(plan, codebooks, tiles, ErrorSums.total(tile.errors for tile in tiles))
     if levels is None:
         return encoded
@@ -233,7 +252,7 @@ def _encode_buckets(
         for bucket, numbers in zip(buckets, roots, strict=True)
     )
     parents, top = levels.build_top(parts, context)
-    for numbers, parent in zip(roots, parents, strict=False):
+    for numbers, parent in zip(roots, parents, strict=False):  # no parents if no level is above the buckets
         for number in numbers:
             nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
     nodes += [
@@ -243,5 +262,5 @@ def _encode_buckets(
 
 
 def _renumbered(node: FileNode, first: int) -> FileNode:
-    """Return a node whose parent is counted from `first`."""
+    """Return a node with `first` added to the index of its parent; a root is returned as it is."""
     return node if node.parent is None else replace(node, parent=node.parent + first)

@@ -120,7 +120,7 @@ def find_columns(
     every, rest, problem = _find_rest(names, sh_degree)
     if problem is not None:
         findings.append(problem)
-    if integers := _integers(dtype, (coefficients, rest, opacity, scales, quats)):
+    if integers := _integer_finding(dtype, (coefficients, rest, opacity, scales, quats)):
         findings.append(integers)
     normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
     filter_3d = names.find((_FILTER,))[0]
@@ -158,7 +158,7 @@ def _sphere_column(names: _NameIndex, scales: Sequence[str]) -> str:
 
 def dropped_columns(names: Sequence[str]) -> Finding:
     """Report dropped columns that are not splat attributes, and the kind of scene that they indicate."""
-    meaning = _meaning(names)
+    meaning = _kind_of_columns(names)
     text = f"columns {', '.join(names)} are not splat attributes: dropped"
     text += "" if meaning is None else f"; the file contains {meaning}"
     return Finding("extra-columns", len(names), text, "repair")
@@ -199,10 +199,14 @@ class _NameIndex:
         return all(name in self.plain for name in wanted)
 
     def find(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the column for each usual name; "" if it is absent or several columns have aliases of the name."""
+        """Return the column for each usual name; "" if it is absent.
+
+        If several columns have aliases of the name, the first is returned, and `findings` reports an error.
+        """
         return tuple(self._find(name) for name in wanted)
 
     def _find(self, name: str) -> str:
+        """Return a column as `find` does; record aliases, duplicates and ambiguities for `findings`."""
         columns = self.plain.get(name.lower(), [])
         if name in columns:
             self._second += [column for column in columns if column != name]
@@ -230,6 +234,7 @@ class _NameIndex:
 
 
 def _list_some(words: Sequence[str]) -> str:
+    """Join words for messages; beyond `_NAMED` of them, only their number is stated."""
     more = len(words) - _NAMED
     return ", ".join(words[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
@@ -248,10 +253,11 @@ def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, 
 
 
 def _list_colours(colours: Sequence[str]) -> str:
+    """Join the names of three colour columns for messages."""
     return f"{', '.join(colours[:2])} and {colours[2]}"
 
 
-def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
+def _integer_finding(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
     """Report columns of integers, whose scale is unknown."""
     integers = [name for group in groups for name in group if name and dtype[name].kind != "f"]
     if not integers:
@@ -267,7 +273,7 @@ def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Seque
     """Describe missing columns and the probable kind of the file."""
     text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
     shown = f"it has {_list_some(names.all)}" if names.all else "it has no columns"
-    if (meaning := _meaning(names.all)) is not None:
+    if (meaning := _kind_of_columns(names.all)) is not None:
         return f"{text}, but {meaning}: export plain splats"
     if {*_SCALES, *_QUATS, _OPACITY} <= set(missing):
         if "face" in elements:
@@ -276,7 +282,8 @@ def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Seque
     return f"{text}; {shown}"
 
 
-def _meaning(names: Sequence[str]) -> str | None:
+def _kind_of_columns(names: Sequence[str]) -> str | None:
+    """Return the kind of file that has one of the columns; `None` if it is unknown."""
     plain = [plain_name(name) for name in names]
     return next((meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain))), None)
 
@@ -300,7 +307,8 @@ def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...
         return every, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
     if kept == degree:
         return every, every, None
-    rest = tuple(every[channel * bands + band] for channel in range(3) for band in range((kept + 1) ** 2 - 1))
+    kept_bands = (kept + 1) ** 2 - 1
+    rest = tuple(every[channel * bands + band] for channel in range(3) for band in range(kept_bands))
     if degree <= MAX_SH_DEGREE:
         return every, rest, None
     text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are dropped, as requested"

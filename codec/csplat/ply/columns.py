@@ -48,11 +48,13 @@ _BYTE, _WORD = 255.0, 65535.0  # the value of white for colours of 8 and 16 bits
 _POSITIONS = ("x", "y", "z")
 _BAD_SHARE = 0.01  # maximum fraction of NaN and infinity among half floats
 _SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions in half floats; integers read as half floats are outside
+_ODD_SHARE = 0.1  # maximum fraction of rotations with other lengths among half floats
 _MAX_SPREAD = 256.0  # maximum ratio of the 90th to the 50th percentile of positions in half floats
 _FEW = 16  # splats; a property that fewer have in common may be coincidence
 _TINY = 1e-30  # smallest divisor
 _ROUNDING = 1e-3  # tolerance by which alphas may exceed 0 and 1
 _SAMPLE_OF_BLOCK = 256  # splats per block whose scales are compared with the scene's extent
+_EXTENT_QUANTILES = (0.95, 0.05)  # of means, whose difference is the extent of a scene without outliers
 _LENGTHS_RATIO = 3.0  # minimum ratio of the 95th to the 5th percentile of scales that are lengths
 _BYTE_COLOUR = 4.0  # a larger f_dc is much brighter than white (1.77) and may be a colour of 0 to 255
 
@@ -124,12 +126,12 @@ def gather_arrays(
     at = 0
     with np.errstate(over="ignore", invalid="ignore"):  # `_repair` detects overflow of float32
         for rows in blocks:
-            part = _part(out, slice(at, at + len(rows)))
+            part = _slice_arrays(out, slice(at, at + len(rows)))
             _copy(rows, columns, part)
             statistics.normals += _count_nonzero_rows(rows, columns.normals)
             widths = rows[columns.filter_3d].astype(np.float64) if columns.filter_3d else None
             at += _repair(part, columns, statistics, widths)
-    kept = _part(out, slice(0, at))
+    kept = _slice_arrays(out, slice(0, at))
     if len(columns.scales) == 2 and at:
         kept.scales[:, 2] = choose_thickness(kept.scales[:, :2], thinnest)
     return kept
@@ -156,7 +158,7 @@ def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStat
     statistics.has_columns = False
     columns = ColumnMap((), ("",) * scale_count, (), (), (), "", (), (), double=False)
     for start in range(0, len(arrays.means), _SAMPLE_ROWS):
-        part = _part(arrays, slice(start, start + _SAMPLE_ROWS))
+        part = _slice_arrays(arrays, slice(start, start + _SAMPLE_ROWS))
         copies = {name: array.copy() for name, array in vars(part).items() if name != "extra"}
         _repair(AttributeArrays(**copies), columns, statistics, None)
 
@@ -212,7 +214,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
         lengths = np.sqrt((quats * quats).sum(axis=0))
         odd = (lengths > 0.0) & ~((lengths >= _SANE_LENGTHS[0]) & (lengths <= _SANE_LENGTHS[1]))
         large = (np.abs(scales) > HUGE_LOG) & np.isfinite(scales)
-        return bool(odd.sum() <= 0.1 * len(rows) and large.sum() <= _BAD_SHARE * large.size)
+        return bool(odd.sum() <= _ODD_SHARE * len(rows) and large.sum() <= _BAD_SHARE * large.size)
     positions = np.stack([named.get(axis, absent) for axis in _POSITIONS], 1)
     positions = np.abs(positions[np.isfinite(positions).all(axis=1)])
     if len(positions) < _FEW:
@@ -279,6 +281,7 @@ def logits_of_alpha(alpha: F32) -> F32:
 
 
 def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extra: bool) -> AttributeArrays:
+    """Return uninitialised arrays for `count` splats; extra columns have the byte order of the machine."""
     extra = columns.extra if keep_extra else ()
     return AttributeArrays(
         means=np.empty((count, 3), np.float64 if columns.double else np.float32),
@@ -291,7 +294,8 @@ def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extr
     )
 
 
-def _part(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
+def _slice_arrays(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
+    """Return views of some rows of all arrays."""
     named = {name: array[rows] for name, array in vars(arrays).items() if name != "extra"}
     return AttributeArrays(**named, extra={name: column[rows] for name, column in arrays.extra.items()})
 
@@ -372,7 +376,7 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
         for array in (*vars(part).values(), *part.extra.values()):
             if isinstance(array, np.ndarray):
                 array[:kept] = array[good]
-        part = _part(part, slice(0, kept))
+        part = _slice_arrays(part, slice(0, kept))
         widths = None if widths is None else widths[good]
         statistics.infinite_logits += int(np.count_nonzero(np.isinf(part.opacities)))
     statistics.opacities = _extend_range(statistics.opacities, part.opacities)
@@ -452,7 +456,11 @@ def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
 
 
 def _repair_quats(quats: F32, statistics: RowStatistics) -> None:
-    """Normalise quaternions [n, 4] in place, and count the rows that had another length."""
+    """Normalise quaternions [n, 4] in place.
+
+    Adds to `statistics` the number of zero rows and of other rows that were not of unit length, and the range of
+    lengths.
+    """
     wide = quats.astype(np.float64)
     squared = squared_lengths(wide)
     zero = int(np.count_nonzero(squared == 0.0))
@@ -490,10 +498,10 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
         Finding("filter-3d", s.filtered, fused, "note"),
         Finding("huge-values", s.huge, f"{counted(s.huge, 'splat')} with {huge}", "note"),
     ]
-    return [finding for finding in findings if finding.count] + _suspicions(s, count - s.nonfinite)
+    return [finding for finding in findings if finding.count] + _activation_findings(s, count - s.nonfinite)
 
 
-def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
+def _activation_findings(statistics: RowStatistics, kept: int) -> list[Finding]:
     """Report ranges that indicate values after their activation, which trained scenes do not have."""
     findings = []
     colours = statistics.colours
@@ -523,7 +531,7 @@ def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
 def _are_lengths(statistics: RowStatistics) -> bool:
     """Return True if positive scales are plausible as lengths but not as logarithms."""
     means, scales = (np.concatenate(arrays) for arrays in zip(*statistics.sample, strict=True))
-    extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())
+    extent = float(np.subtract(*np.quantile(means, _EXTENT_QUANTILES, axis=0)).max())
     low, middle, high = np.quantile(scales, (0.05, 0.5, 0.95)).tolist()
     # Lengths vary by factors. Read as logarithms, they would give all splats a size of about a scene unit.
     alike = middle < 1.0 and high > _LENGTHS_RATIO * low
@@ -531,4 +539,5 @@ def _are_lengths(statistics: RowStatistics) -> bool:
 
 
 def _lie_in(bounds: tuple[float, float], low: float, high: float) -> bool:
+    """Return True if a range is inside low..high and has more than one value."""
     return low <= bounds[0] < bounds[1] <= high

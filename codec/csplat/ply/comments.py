@@ -80,7 +80,7 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
         words = comment.split()
         mode = _MODES.get(tuple(comment.lower().split()))
         if words[:2] == [_PREFIX, TRAINING]:
-            entries[TRAINING] = _training(comment).as_json()
+            entries[TRAINING] = _parse_training(comment).as_json()
         elif words[:2] == [_PREFIX, VIEW]:
             entries[VIEW] = _view(comment)
         elif mode is not None:
@@ -160,7 +160,12 @@ def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, t
 def _with_vertical_axis(
     metadata: SceneMetadata, comments: Sequence[str]
 ) -> tuple[SceneMetadata, Sequence[str], tuple[Finding, ...]]:
-    """Add the up direction from comments on the vertical axis unless it is known; also return the comments to keep."""
+    """Add the up direction that comments on the vertical axis specify, unless it is known.
+
+    Returns:
+        The metadata; the comments to keep, which are those that contradict each other or the known direction; and a
+        finding if a direction was added or the comments contradict each other.
+    """
     if not comments:
         return metadata, (), ()
     directions = set()
@@ -168,7 +173,8 @@ def _with_vertical_axis(
         match = _VERTICAL_AXIS.fullmatch(comment)
         assert match is not None, "it was matched before"
         sign, axis = match.groups()
-        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == name) + 0.0 for name in "xyz"))
+        length = -1.0 if sign == "-" else 1.0
+        directions.add(tuple(length if axis.lower() == name else 0.0 for name in "xyz"))
     if len(directions) > 1:
         text = f"the comments {' and '.join(map(repr, comments))} contradict each other: ignored"
         return metadata, comments, (Finding("vertical-axis", len(comments), text, "note"),)
@@ -180,15 +186,15 @@ def _with_vertical_axis(
 
 
 def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values: Sequence[str]) -> bool:
-    """Set the field or entry of a csplat comment; return False if its key is unknown."""
+    """Set the field or entry of a csplat comment; return False if its key or its number of values is unknown."""
     if key in ("origin", "absolute_origin"):
-        fields |= {"origin": tuple(_numbers(key, values, 3)), "origin_is_added": key == "absolute_origin"}
+        fields |= {"origin": tuple(_parse_numbers(key, values, 3)), "origin_is_added": key == "absolute_origin"}
     elif key == "coordinate_system" and len(values) == 1:
         fields[key] = values[0]
     elif key == UP:
-        entries[UP] = _up(values)
+        entries[UP] = _parse_up(values)
     elif key == "unit_metres":
-        (fields[key],) = _numbers(key, values, 1)
+        (fields[key],) = _parse_numbers(key, values, 1)
     elif key in ("antialiased", "flat") and not values:
         fields[key] = True
     elif key == LICENCE and values:
@@ -198,15 +204,17 @@ def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values
     return True
 
 
-def _up(values: Sequence[str]) -> list[float]:
-    numbers = _numbers(UP, values, 3)
+def _parse_up(values: Sequence[str]) -> list[float]:
+    """Parse an up direction to a unit vector; raise an `InputError` that quotes the comment if it is not one."""
+    numbers = _parse_numbers(UP, values, 3)
     try:
         return list(unit_up(numbers))
     except InputError as error:
         raise InputError(f"the header comment {' '.join((_PREFIX, UP, *values))!r}: {error}") from None
 
 
-def _training(comment: str) -> TrainingRecord:
+def _parse_training(comment: str) -> TrainingRecord:
+    """Parse a training record; raise an `InputError` that quotes the comment if it is invalid."""
     value = _json(comment)
     try:
         return TrainingRecord.from_json(value)
@@ -223,6 +231,7 @@ def _view(comment: str) -> dict[str, Any]:
 
 
 def _is_json(value: object) -> bool:
+    """Return True if a value can be written as JSON: without NaN and infinity, and not nested too deeply."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError):
@@ -231,7 +240,7 @@ def _is_json(value: object) -> bool:
 
 
 def _json(comment: str) -> object:
-    """Parse the JSON after the first two words of a comment."""
+    """Parse the JSON after the first two words of a comment; raise an `InputError` that quotes it if it is none."""
     try:
         return parse_json("".join(comment.split(None, 2)[2:]))
     except InputError as error:
@@ -239,10 +248,12 @@ def _json(comment: str) -> object:
 
 
 def _comment_error(comment: str, reason: str) -> InputError:
+    """Return an error that quotes the start of a header comment."""
     return InputError(f"the header comment {comment[:_SHOWN]!r} is invalid: {reason}")
 
 
-def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
+def _parse_numbers(key: str, values: Sequence[str], count: int) -> list[float]:
+    """Parse the values of a comment; raise an `InputError` unless they are `count` finite numbers."""
     try:
         numbers = [float(value) for value in values]
     except ValueError:

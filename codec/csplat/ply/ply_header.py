@@ -137,6 +137,7 @@ def _split(text: bytes) -> list[bytes]:
 
 
 def _is_element(words: Sequence[bytes]) -> bool:
+    """Return True for the words of a complete element line."""
     return words[:1] == [b"element"] and len(words) == 3
 
 
@@ -166,6 +167,7 @@ def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
 
 
 def _has_line_end(lines: list[bytes]) -> bool:
+    """Return True if a line contains a line end, of another kind than the one it was split at."""
     return any(_LINE_END.search(line) for line in lines)
 
 
@@ -188,6 +190,7 @@ def _normalise_line(line: bytes) -> bytes:
 
 
 def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
+    """Return the elements of a header, given as the words of each line, with names of properties in order."""
     elements: list[PlyElement] = []
     for words in lines:
         if _is_element(words):
@@ -206,6 +209,7 @@ def _parse_count(word: bytes) -> int:
 
 
 def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
+    """Report row counts that are negative or exceed the file size of `size` bytes, as errors."""
     findings = []
     for words in filter(_is_element, lines):
         word, count = words[2].decode(), _parse_count(words[2])
@@ -268,7 +272,7 @@ def parse_text_rows(
         except RowError as error:
             first = first or error
             continue
-        oddities += [separators] * bool(separators) + layout
+        oddities += [separators, *layout] if separators else layout
         note = f"the rows have {', '.join(oddities)}"
         findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
         if rest:
@@ -295,13 +299,16 @@ def _split_rows(
     Rows may share a line or continue on the next line, provided that every line end is a row end or every row end is a
     line end. So a missing value never shifts the values after it. An object per word is made only for a wanted element
     whose rows are not on lines of their own.
+
+    Raises:
+        RowError: rows are missing, or have another number of values than declared.
     """
     counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
     filled = np.flatnonzero(counts)
     oddities = ["blank lines"] if len(filled) and filled[-1] >= len(filled) else []
     lines, counts = [line for line in lines if line.strip()], counts[filled]
     rows: dict[str, list[str]] = {}
-    at = 0
+    at = 0  # line of the next row
     for element in elements:
         width, count = len(element.properties), element.count
         if not width:
@@ -315,21 +322,22 @@ def _split_rows(
             at = stop
             continue
         ends = np.cumsum(counts[at : at + width * count])
-        used = int(np.searchsorted(ends, width * count)) + 1  # lines
-        whole = np.count_nonzero(ends[:used] % width == 0)  # rows that end with a line
-        if used > len(ends) or ends[used - 1] != width * count or whole not in (count, used):
+        line_count = int(np.searchsorted(ends, width * count)) + 1
+        common_ends = np.count_nonzero(ends[:line_count] % width == 0)  # ends of a line and a row
+        if line_count > len(ends) or ends[line_count - 1] != width * count or common_ends not in (count, line_count):
             row = int((counts[at:] != width).argmax())
             text = f"row {row} of {element.name} has {counts[at + row]} values, expected {width}"
             raise RowError(Finding("malformed", 1, text, "error"))
         if element.name in wanted:
-            words = [word for line in lines[at : at + used] for word in line.split()]
+            words = [word for line in lines[at : at + line_count] for word in line.split()]
             rows[element.name] = [" ".join(words[first : first + width]) for first in range(0, len(words), width)]
-        oddities.append(f"{count} of {element.name} in {used} lines" if used > 1 else "all values in one line")
-        at += used
-    rest = int(counts[at:].sum())
-    if rest and at != sum(element.count for element in elements):
-        text = f"found {counted(rest, 'value')} after rows that are not on separate lines"
-        raise RowError(Finding("malformed", rest, text, "error"))
+        layout = f"{count} of {element.name} in {line_count} lines" if line_count > 1 else "all values in one line"
+        oddities.append(layout)
+        at += line_count
+    surplus = int(counts[at:].sum())  # values after the last row
+    if surplus and at != sum(element.count for element in elements):
+        text = f"found {counted(surplus, 'value')} after rows that are not on separate lines"
+        raise RowError(Finding("malformed", surplus, text, "error"))
     return rows, oddities, len(" ".join(" ".join(lines[at:]).split()))
 
 

@@ -225,6 +225,7 @@ def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False)
 
 
 def _input_error(path: Path, error: Exception) -> InputError:
+    """Return an `InputError` with the file's name and the start of another error's message."""
     return InputError(f"{path.name}: {str(error)[:_SHOWN_NAMES] or type(error).__name__}")
 
 
@@ -240,6 +241,7 @@ def _packed_colours(path: Path, header: PlyHeader, declared: Any, findings: list
     single = [prop for prop in properties if not is_list(prop)]
     packed = next((prop for prop in single if prop.name in _PACKED_COLOURS and prop.val_dtype == "u1"), None)
     surplus = path.stat().st_size - header.end - count * row_type(properties).itemsize
+    # Two bytes of colour per row remain after the declared ones.
     if packed is None or len(single) < len(properties) or count == 0 or surplus != 2 * count:
         return b""
     if names & {"red", "green", "blue", "f_dc_0"}:
@@ -326,8 +328,9 @@ class _Survey(NamedTuple):
 
 
 def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
-    """Read all rows once, appending to `findings`."""
-    statistics, kept_count, means, thinnest = RowStatistics(), 0, [], math.inf
+    """Read all rows once, and append the findings about them to `findings`."""
+    statistics, means = RowStatistics(), []
+    kept_count, thinnest = 0, math.inf
     for block in ply.blocks(BLOCK_SPLATS):
         arrays = gather_arrays([block], len(block), ply.rows.dtype, ply.columns, statistics=statistics)
         kept_count += len(arrays.means)
@@ -370,12 +373,14 @@ def _model_blocks(ply: _OpenPly, survey: _Survey, *, keep_extra: bool) -> Iterat
 
 
 def _doubles_finding(ply: _OpenPly, count: int, origin: tuple[float, float, float]) -> Finding:
+    """Report that `count` means were rounded to float32 relative to an origin."""
     is_float = all(ply.rows.dtype[name].kind == "f" for name in ply.columns.means)
     text = f"positions are {'in doubles' if is_float else 'integers'}: {count} means are float32 relative to {origin}"
     return Finding("double-means", count, text, "note")
 
 
 def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) -> SplatModel:
+    """Return a model of arrays, with the positions and the metadata of a file; two scales mean flat splats."""
     (means, origin, doubles), metadata = positions, ply.comments.metadata
     return SplatModel(
         means=means,
@@ -415,16 +420,18 @@ def _read_rows(path: Path, header: PlyHeader, declared: Any, findings: list[Find
 
 
 def _is_needed(element: Any) -> bool:
+    """Return True for splats with a scalar column, and for an element whose first scalar column is its colour space."""
     if element.name == _COLOUR_SPACE:
         return [prop.name for prop in element.properties if not is_list(prop)][:1] == [_COLOUR_SPACE]
     return element.name == SPLAT_ELEMENT and not all(map(is_list, element.properties))
 
 
 def _read_binary(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read binary rows of the elements that are needed; lists are skipped. As in `_read_rows`."""
     rows: dict[str, Rows] = {}
     at, size, order = header.end, path.stat().st_size, declared.byte_order
-    for element, count in zip(declared, (header_element.count for header_element in header.elements), strict=True):
-        name, properties = element.name, element.properties
+    for element, header_element in zip(declared, header.elements, strict=True):
+        name, properties, count = element.name, element.properties, header_element.count
         if any(map(is_list, properties)):
             data = memoryview(map_file(path))
             if not _is_needed(element):
@@ -451,25 +458,25 @@ def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Fin
     """Read text with a row in each line; raise an error for any other layout."""
     rows: dict[str, Rows] = {}
     with open_binary(path) as file:
-        left = file.seek(0, io.SEEK_END) - header.end
+        rows_size = file.seek(0, io.SEEK_END) - header.end
         file.seek(header.end)
         stream = io.TextIOWrapper(file, encoding="ascii", errors="replace", newline="")
         for element, header_element in zip(declared, header.elements, strict=True):
             absent = RowError(truncated_finding(header_element.name, header_element.count, 0))
-            # Refuse before memory for the rows is allocated.
-            if header_element.count * 2 * len(header_element.properties) > left + 1:
+            # Refuse before memory for the rows is allocated: a value takes a digit and a separator, except the last.
+            if header_element.count * 2 * len(header_element.properties) > rows_size + 1:
                 raise absent
             if _is_needed(element):
                 rows[header_element.name] = _parse_lines(declared, element, header_element.count, stream)
             elif header_element.count != sum(1 for _ in islice(_scalar_lines(element, stream), header_element.count)):
                 raise absent
-        rest = len(stream.read().strip())
-    findings += _rest_findings(rest)
+        surplus_bytes = len(stream.read().strip())
+    findings += _rest_findings(surplus_bytes)
     return rows
 
 
 def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
-    """Read text of any layout."""
+    """Read text of any layout, as `parse_text_rows` splits it; as in `_read_rows`."""
     with open_binary(path) as stream:
         stream.seek(header.end)
         needed = [element.name for element in declared if _is_needed(element)]
@@ -486,11 +493,12 @@ def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Fi
 
 
 def _scalar_lines(element: Any, lines: Iterable[str]) -> Iterator[str]:
+    """Return text rows of an element without the values of its lists."""
     return lines_without_lists(lines, element.name, element.properties)
 
 
 def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) -> Rows:
-    """Parse text with a row in each line."""
+    """Parse the first `count` lines, a row each, without the values of lists; as in `_read_rows`."""
     if any(map(is_list, element.properties)):
         lines = _scalar_lines(element, lines)
     header = io.StringIO(_element_header(declared, element, count).decode())
@@ -560,6 +568,7 @@ def _trailing_findings(path: Path, header: PlyHeader, end: int) -> list[Finding]
 
 
 def _rest_findings(count: int) -> list[Finding]:
+    """Report `count` bytes after the last row; no finding for 0."""
     text = f"{counted(count, 'byte')} after the last row: ignored"
     return [Finding("trailing-bytes", count, text, "repair")] if count else []
 
@@ -593,6 +602,9 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
         path: path of the file.
         rows: as `parse_ply` returns them.
         max_rows: rows per block; `None`: the number that fits in the cache.
+
+    Raises:
+        InputError: the file became shorter.
     """
     step = max_rows or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
     if not isinstance(rows, np.memmap):

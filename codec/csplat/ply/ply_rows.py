@@ -99,20 +99,20 @@ def lines_without_lists(lines: Iterable[str], name: str, properties: Sequence[An
     are_lists = [is_list(prop) for prop in properties]
     for row, line in enumerate(lines):
         words = line.split()
-        kept, at = words, len(are_lists)
+        scalars, at = words, len(are_lists)  # at: index after the last declared value
         if any(are_lists):
-            kept, at = [], 0
+            scalars, at = [], 0
             for listed in are_lists:
                 word = words[at] if at < len(words) else ""
                 at += 1
                 if not listed:
-                    kept.append(word)
+                    scalars.append(word)
                 elif word.isdecimal() and len(word) <= _MAX_DIGITS:
                     at += int(word)
                 else:
-                    at = -1
+                    at = -1  # not a count: matches no number of words
                     break
         if at != len(words):
             text = f"row {row} of {name} has {len(words)} values, which its properties do not match"
             raise RowError(Finding("malformed", 1, text, "error"))
-        yield " ".join(kept)
+        yield " ".join(scalars)

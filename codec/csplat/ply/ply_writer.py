@@ -59,17 +59,18 @@ def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *
     dtype = _row_dtype(scene, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with open_writer(file) as stream:
-        stream.write(_header(scene, absolute=absolute))
+        stream.write(_build_header(scene, absolute=absolute))
         rows = np.zeros(min(step, scene.count), dtype)
         for model in scene.blocks():
             for start in range(0, len(model), step):
                 part = slice(start, min(start + step, len(model)))
                 block = rows[: part.stop - part.start]
-                _fill(block, model, part, absolute=absolute)
+                _fill_rows(block, model, part, absolute=absolute)
                 stream.write(block.view(np.uint8).data)
 
 
 def _row_dtype(scene: Scene, *, absolute: bool) -> np.dtype[Any]:
+    """Return the type of a row as the writer stores it; `absolute` positions are doubles."""
     coefficients = (scene.sh_degree + 1) ** 2 - 1
     return np.dtype(
         [
@@ -85,7 +86,8 @@ def _row_dtype(scene: Scene, *, absolute: bool) -> np.dtype[Any]:
     )
 
 
-def _header(scene: Scene, *, absolute: bool) -> bytes:
+def _build_header(scene: Scene, *, absolute: bool) -> bytes:
+    """Return the header of a PLY with its comments; raise an `InputError` for an extra column that it cannot name."""
     # Comments come last because SIBR's viewer expects the element on the third line.
     position = "double" if absolute else "float"
     rest_count = 3 * ((scene.sh_degree + 1) ** 2 - 1)
@@ -104,6 +106,7 @@ def _header(scene: Scene, *, absolute: bool) -> bytes:
 
 
 def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
+    """Return the PLY type of an extra column; raise an `InputError` for a name or a type that PLY lacks."""
     if not name.isascii() or name.split() != [name]:
         raise InputError(f"extra column {name!r}: a PLY property is one word of ASCII")
     kind = _PLY_TYPES.get(f"{dtype.kind}{dtype.itemsize}")
@@ -112,7 +115,7 @@ def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
     return kind
 
 
-def _fill(block: NDArray[Any], model: SplatModel, part: slice, *, absolute: bool) -> None:
+def _fill_rows(block: NDArray[Any], model: SplatModel, part: slice, *, absolute: bool) -> None:
     """Copy some splats of a model into rows whose normals are zero."""
     if absolute:
         doubles = model.means_double

@@ -161,8 +161,8 @@ def verify_bounds(
         InputError: `source_index` does not contain one index of a source splat for each splat of the file.
     """
     claims = _read_claims(measure_names(source, decoded), len(source), source.sh_degree, header, declared)
-    if claims.wrong:
-        return _outcome(claims)
+    if claims.contradictions:
+        return _build_verification(claims)
     if source_index is not None:
         check_source_index(source_index, len(source), len(decoded))
         pairs = PairErrors(
@@ -170,10 +170,10 @@ def verify_bounds(
             find_wrong_extras(source, decoded, source_index),
             source.reach(decoded.origin),
         )
-        return _judge_pairs(claims, header, pairs, source_index)
+        return _verify_pairs(claims, header, pairs, source_index)
     if "means" not in claims.bounds:  # there is no search radius
-        return _outcome(replace(claims, unverified=claims.names if header.splat_count else ()))
-    return _search_partners(claims, source, decoded, header, context)
+        return _build_verification(replace(claims, unverified=claims.names if header.splat_count else ()))
+    return _verify_without_index(claims, source, decoded, header, context)
 
 
 def verify_bounds_by_tile(
@@ -191,10 +191,10 @@ def verify_bounds_by_tile(
     names = measure_names(scene.empty(), opened.empty())
     degree = scene.sh_degree
     claims = _read_claims(names, scene.count, degree, opened.header, opened.declared_bounds)
-    if claims.wrong:
-        return _outcome(claims)
+    if claims.contradictions:
+        return _build_verification(claims)
     pairs = measure_pairs_by_tile(scene, opened, source_index, splats_max, context=context)
-    return _judge_pairs(claims, opened.header, pairs, source_index)
+    return _verify_pairs(claims, opened.header, pairs, source_index)
 
 
 @dataclass(frozen=True)
@@ -205,50 +205,70 @@ class _Claims:
         names: measures that apply to file and source, in the order of the registry.
         bounds: (max, rms) by measure.
         unverified: measures without a declared bound.
-        wrong: contradictions that show without a comparison of splats.
+        contradictions: contradictions that show without a comparison of splats.
     """
 
     names: tuple[str, ...]
     bounds: _Bounds
     unverified: tuple[str, ...]
-    wrong: _Contradictions
+    contradictions: _Contradictions
 
 
 def _read_claims(
     names: Sequence[str], source_count: int, source_degree: int, header: SceneHeader, declared: DeclaredBounds | None
 ) -> _Claims:
+    """Return the declared bounds with the contradictions that need no splats: SER-6, and SER-5 of count and degree.
+
+    Args:
+        names: measures that apply to file and source, in the order of the registry.
+        source_count: splats of the source.
+        source_degree: SH degree of the source.
+        header: the file's header. A file without splats needs no bounds.
+        declared: its error bounds; `None` if it declares none, which violates SER-6.
+    """
     if declared is None:
         return _Claims(tuple(names), {}, tuple(names), [("SER-6", "the file declares no bounds")])
     bounds = {record.measure: (record.max, record.rms) for record in declared.records}
     unverified = tuple(name for name in names if name not in bounds) if header.splat_count else ()
-    wrong = []
+    contradictions = []
     if source_count != declared.source_count:
-        wrong.append(("SER-5", f"the source has {source_count} splats, the file declares {declared.source_count}"))
+        count = declared.source_count
+        contradictions.append(("SER-5", f"the source has {source_count} splats, the file declares {count}"))
     if source_degree != declared.source_sh_degree:
         degree = declared.source_sh_degree
-        wrong.append(("SER-5", f"the source has SH degree {source_degree}, the file declares {degree}"))
+        contradictions.append(("SER-5", f"the source has SH degree {source_degree}, the file declares {degree}"))
     if not declared.refitted:
-        wrong += [("SER-6", f"the file declares no bound for {name}") for name in unverified]
-    return _Claims(tuple(names), bounds, unverified, wrong)
+        contradictions += [("SER-6", f"the file declares no bound for {name}") for name in unverified]
+    return _Claims(tuple(names), bounds, unverified, contradictions)
 
 
-def _outcome(
+def _build_verification(
     claims: _Claims,
     measures: Sequence[MeasureVerification] = (),
-    wrong: _Contradictions | None = None,
+    contradictions: _Contradictions | None = None,
     *,
     rms_verified: bool = False,
 ) -> BoundsVerification:
-    wrong = claims.wrong if wrong is None else wrong
-    clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
+    """Return the result, with the measures in the order of the registry and each clause once.
+
+    Without `contradictions`, those of `claims` are the failures.
+    """
+    contradictions = claims.contradictions if contradictions is None else contradictions
+    clauses = tuple(dict.fromkeys(clause for clause, _ in contradictions))
     ordered = tuple(sorted(measures, key=lambda measure: claims.names.index(measure.name)))
-    return BoundsVerification(ordered, tuple(line for _, line in wrong), clauses, claims.unverified, rms_verified)
+    failures = tuple(line for _, line in contradictions)
+    return BoundsVerification(ordered, failures, clauses, claims.unverified, rms_verified)
 
 
-def _judge_pairs(
+def _verify_pairs(
     claims: _Claims, header: SceneHeader, pairs: PairErrors, source_index: NDArray[Any]
 ) -> BoundsVerification:
-    bounds, measures = claims.bounds, []
+    """Verify maximum, rms and extra columns of the pairs of a source index, [N] (SER-5, SRC-3).
+
+    Measures without a declared bound are reported without a verdict.
+    """
+    bounds = claims.bounds
+    measures: list[MeasureVerification] = []
     failures = [("SRC-3", line) for line in pairs.extras]
     for name, error in pairs.measured.items():
         worst = None
@@ -258,10 +278,10 @@ def _judge_pairs(
         if name not in bounds:
             measures.append(MeasureVerification(name, None, None, error.max, error.rms, None, worst))
             continue
-        wrong = find_contradictions(name, error[:2], bounds[name], pairs.reach, worst)
-        failures += [("SER-5", line) for line in wrong]
-        measures.append(MeasureVerification(name, *bounds[name], error.max, error.rms, not wrong, worst))
-    return _outcome(claims, measures, failures, rms_verified=bool(measures))
+        lines = find_contradictions(name, error[:2], bounds[name], pairs.reach, worst)
+        failures += [("SER-5", line) for line in lines]
+        measures.append(MeasureVerification(name, *bounds[name], error.max, error.rms, not lines, worst))
+    return _build_verification(claims, measures, failures, rms_verified=bool(measures))
 
 
 def find_contradictions(
@@ -296,45 +316,51 @@ def tile_of(header: SceneHeader, splat: int) -> int:
 # Without a source index ----------------------------------------------------------------------------
 
 
-def _search_partners(
+def _verify_without_index(
     claims: _Claims, source: Source, decoded: SplatModel, header: SceneHeader, context: Context
 ) -> BoundsVerification:
+    """Verify that each splat has a splat of the source within the declared maxima (SER-5).
+
+    A file with undecided splats fails, too. The worst errors are searched for the first splats without a partner only.
+    """
     bounds = claims.bounds
-    largest = {name: pair[0] for name, pair in bounds.items()}
-    partners = find_partners(source, decoded, largest, lattice_radii(decoded, header), context=context)
-    alone = np.flatnonzero(partners == UNMATCHED)
-    undecided = int(np.count_nonzero(partners == UNDECIDED))
+    declared_maxima = {name: pair[0] for name, pair in bounds.items()}
+    partners = find_partners(source, decoded, declared_maxima, lattice_radii(decoded, header), context=context)
+    unmatched = np.flatnonzero(partners == UNMATCHED)
+    undecided_count = int(np.count_nonzero(partners == UNDECIDED))
     lines = []
-    if undecided:
-        lines.append(f"{undecided} splats have too many similar splats in the source: specify a source index")
+    if undecided_count:
+        lines.append(f"{undecided_count} splats have too many similar splats in the source: specify a source index")
     worst: dict[str, WorstSplat] = {}
     searched_count = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, len(source))))
-    if len(alone):
-        worst = _find_worst(source, decoded, header, largest, alone[:searched_count], context.progress)
-        many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
+    if len(unmatched):
+        worst = _find_worst_splats(
+            source, decoded, header, declared_maxima, unmatched[:searched_count], context.progress
+        )
+        many = f"{len(unmatched)} splats of the file have" if len(unmatched) > 1 else "1 splat of the file has"
         lines.append(f"{many} no splat of the source within the declared maxima")
         lines += [
-            f"{name}: {splat.found:.9g} is above the declared {largest[name]:.9g}: splat {splat.splat}"
+            f"{name}: {splat.found:.9g} is above the declared {declared_maxima[name]:.9g}: splat {splat.splat}"
             f" (tile {splat.tile}), nearest source splat {splat.source_splat}"
             for name, splat in worst.items()
         ]
     # It is unknown which bounds the other splats without a partner exceed.
-    undecided_bounds = len(alone) > searched_count
+    holds_otherwise = None if len(unmatched) > searched_count else True
     measures = [
         MeasureVerification(
             name,
             *bounds[name],
-            None,
-            None,
-            False if name in worst else None if undecided_bounds else True,
-            worst.get(name),
+            measured_max=None,
+            measured_rms=None,
+            holds=False if name in worst else holds_otherwise,
+            worst=worst.get(name),
         )
         for name in bounds
     ]
-    return _outcome(claims, measures, [("SER-5", line) for line in lines])
+    return _build_verification(claims, measures, [("SER-5", line) for line in lines])
 
 
-def _find_worst(
+def _find_worst_splats(
     source: Source,
     decoded: SplatModel,
     header: SceneHeader,
@@ -342,9 +368,10 @@ def _find_worst(
     rows: I64,
     progress: Progress,
 ) -> dict[str, WorstSplat]:
-    """Return by measure the splat of `rows` [n] that exceeds its bound most.
+    """Return the splat of `rows`, [n], with the largest error, for each measure whose bound one of them exceeds.
 
-    Each splat is compared with whichever nearby source splat exceeds the fewest bounds.
+    Each splat is compared with whichever nearby source splat exceeds the fewest bounds. Without source splats, there is
+    no result.
     """
     worst: dict[str, WorstSplat] = {}
     if not len(source):
@@ -359,7 +386,7 @@ def _find_worst(
         beyond = np.stack(
             [largest[name] > bounds[name] + bound_tolerance(name, bounds[name], reach) for name in largest]
         )
-        best = int(beyond.sum(axis=0).argmin())
+        best = int(beyond.sum(axis=0).argmin())  # of `near`
         for name, is_beyond in zip(largest, beyond[:, best].tolist(), strict=True):
             error = float(largest[name][best])
             if is_beyond and (name not in worst or error > worst[name].found):
@@ -368,9 +395,12 @@ def _find_worst(
 
 
 def _nearest_points(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
-    """Return the indices of the centres, [M, 3], nearest to a point, [3], the nearest first."""
+    """Return the indices of the `_NEAREST` centres of `means`, [M, 3], nearest to a point, [3], the nearest first.
+
+    There are fewer if M is smaller.
+    """
     with np.errstate(over="ignore"):
         distances = np.square(means - point).sum(axis=1)
-    near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
-    chosen: I64 = near[np.argsort(distances[near], kind="stable")]
-    return chosen
+    nearest = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
+    ascending: I64 = nearest[np.argsort(distances[nearest], kind="stable")]
+    return ascending

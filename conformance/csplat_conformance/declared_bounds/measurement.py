@@ -21,6 +21,7 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.types import F32, F64
 
+_LOG_SCALE_MAX = 88.0  # magnitude; larger ones count as this (5.5)
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -183,7 +184,7 @@ def measure_pairs(
     def measure_block(start: int) -> dict[str, tuple[float, float, int]]:
         rows = slice(start, min(start + _BLOCK, len(decoded)))
         errors = pair_differences(source, decoded, source_index[rows], rows)
-        return {name: _reduce(values, start) for name, values in errors.items()}
+        return {name: _reduce_errors(values, start) for name, values in errors.items()}
 
     with ThreadPoolExecutor(context.threads) as pool:
         blocks = list(pool.map(measure_block, range(0, len(decoded), _BLOCK)))
@@ -212,6 +213,10 @@ def merge_errors(parts: Sequence[tuple[int, int, dict[str, MeasuredError]]]) -> 
 
 
 def _combine_blocks(blocks: list[tuple[float, float, int]], count: int) -> MeasuredError:
+    """Combine the results of `_reduce_errors` for the blocks of `count` splats; zeros without splats.
+
+    The rms is infinite if the sum of squares is.
+    """
     largest, _, worst = max(blocks, key=lambda block: block[0], default=(0.0, 0.0, 0))
     try:
         squares = math.fsum(block[1] for block in blocks)
@@ -295,8 +300,10 @@ def check_source_index(
             seen[part] = True
 
 
-def _reduce(values: F64, start: int) -> tuple[float, float, int]:
-    """Return the largest magnitude in [n, C], the sum of squares, and the splat with the largest magnitude.
+def _reduce_errors(values: F64, start: int) -> tuple[float, float, int]:
+    """Return the largest magnitude in [n, C], n > 0, the sum of squares, and the splat of the largest magnitude.
+
+    `start` is the index of the first of the n splats.
 
     BLAS is not used, because its sums depend on the number of threads.
     """
@@ -308,6 +315,7 @@ def _reduce(values: F64, start: int) -> tuple[float, float, int]:
 
 
 def _subtract(a: NDArray[Any], b: NDArray[Any]) -> F64:
+    """Return a - b, computed in float64."""
     result: F64 = np.subtract(a, b, dtype=np.float64)
     return result
 
@@ -334,18 +342,25 @@ def _distances(source: Source, decoded: SplatModel, source_rows: SplatRows, deco
 def _covariance_errors(
     source: Source, decoded: SplatModel, source_rows: SplatRows, decoded_rows: SplatRows | slice
 ) -> F64:
-    """Compute |S' - S| / |S|, [n], scaled by the source's largest variance; logs beyond ±88 count as ±88 (5.5)."""
-    scales = source.scales[source_rows].clip(-88.0, 88.0)
+    """Compute |S' - S| / |S|, [n], of the covariances S' of the file and S of the source (5.5)."""
+    scales = source.scales[source_rows].clip(-_LOG_SCALE_MAX, _LOG_SCALE_MAX)
     x, y, z = scales.T  # NumPy is slow along an axis of three
     largest = np.maximum(np.maximum(x, y), z).astype(np.float64)
     theirs = _covariances(source.quats[source_rows], scales, largest)
-    ours = _covariances(decoded.quats[decoded_rows], decoded.scales[decoded_rows].clip(-88.0, 88.0), largest)
+    decoded_scales = decoded.scales[decoded_rows].clip(-_LOG_SCALE_MAX, _LOG_SCALE_MAX)
+    ours = _covariances(decoded.quats[decoded_rows], decoded_scales, largest)
     error: F64 = _frobenius(ours - theirs) / _frobenius(theirs)  # the norm is at least 1
     return error
 
 
 def _covariances(quats: F32, scales: F32, largest: F64) -> F64:
-    """Return xx, yy, zz, xy, xz, yz of R diag(e^(2 (scales - largest))) Rt, [6, n]."""
+    """Return xx, yy, zz, xy, xz, yz of R diag(e^(2 (scales - largest))) Rᵀ, [6, n].
+
+    Args:
+        quats: [n, 4].
+        scales: [n, 3], logarithms.
+        largest: [n], logarithm of the unit, so that no variance overflows.
+    """
     w, x, y, z = quats.T.astype(np.float64)
     f = 2.0 / (w * w + x * x + y * y + z * z)  # quaternions are unit only within a tolerance
     xx, yy, zz = f * x * x, f * y * y, f * z * z
@@ -363,6 +378,7 @@ def _covariances(quats: F32, scales: F32, largest: F64) -> F64:
 
 
 def _entry(a: tuple[F64, F64, F64], b: tuple[F64, F64, F64], variances: F64) -> F64:
+    """Return a · diag(variances) · b, [n], for two rows of a rotation and [3, n] variances."""
     entry: F64 = a[0] * b[0] * variances[0] + a[1] * b[1] * variances[1] + a[2] * b[2] * variances[2]
     return entry
 

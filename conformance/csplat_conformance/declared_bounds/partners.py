@@ -30,12 +30,16 @@ UNDECIDED = -2  #: there are more candidates than were compared
 #: The stage that `Progress` is called with.
 STAGE = "matching splats"
 
+_HALF_DIAGONAL = 0.87  # of a unit cube, √3 / 2, rounded up
+_ROUNDING = 2.0**-22  # of a centre in float32, relative; a few times the error of one rounding
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats per task of a thread
 _FIRST = frozenset(("means", "opacities", "sh0"))  # measures to compare first, the cheap ones
 _PAIR_BLOCK = 4096  # pairs to compare at a time
 _CANDIDATES_MAX = 1000  # splats of one cell to compare; bounds the time for scenes of equal splats
-_MIX = np.uint64(0x9E3779B97F4A7C15)
+_HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Fibonacci hashing)
+_HASH_SHIFT = np.uint64(29)  # bits; brings high bits down, which a product does not
+_EXPONENT_MIN = -1000.0  # of a radius, instead of minus infinity for a radius of 0
 
 
 def find_partners(
@@ -87,12 +91,18 @@ def _radius_levels(radii: F64, bound: float) -> F64:
     """Round radii, [N], up to powers of two, but not beyond the bound, to limit the number of grids."""
     with np.errstate(divide="ignore"):
         exponents = np.ceil(np.log2(radii))
-    rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, -1000.0)), bound)
+    rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, _EXPONENT_MIN)), bound)
     return rounded
 
 
 class _Grid:
-    """The source splats sorted by the hash of their cells."""
+    """The source splats sorted by the hash of their cells.
+
+    Attributes:
+        widths: width of a cell along each of the `_AXES`; infinite for a measure without a bound, 0 for equality.
+        order: [M], the source splats in ascending order of `keys`.
+        keys: [M], sorted hashes.
+    """
 
     def __init__(self, source: Source, radius: float, bounds: Mapping[str, float]) -> None:
         margin = 1.0 + 1e-6  # relative; covers the rounding of coordinates to cells
@@ -102,17 +112,20 @@ class _Grid:
         for start in range(0, len(source), _BLOCK):
             rows = slice(start, start + _BLOCK)
             cells = self.cells(source, rows)
-            keys[rows] = _hash([own for own, _ in cells])
+            keys[rows] = _hash_cells([own for own, _ in cells])
         self.order: I64 = np.argsort(keys, kind="stable")
         self.keys: U64 = keys[self.order]
 
     def cells(self, model: Source | SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
         """Return for each axis the cell of each splat and the nearer neighbour, [n] each."""
         columns = [*model.means[rows].T, model.opacities[rows], model.sh0[rows, 1]]
-        return [_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)]
+        return [
+            _locate_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)
+        ]
 
 
-def _cells(values: F64, width: float) -> tuple[F64, F64]:
+def _locate_cells(values: F64, width: float) -> tuple[F64, F64]:
+    """Return the cell of each value and the neighbour nearer to it, [n] each."""
     if width == 0.0:
         return values, values  # splats match only if they are equal
     with np.errstate(over="ignore"):
@@ -122,13 +135,13 @@ def _cells(values: F64, width: float) -> tuple[F64, F64]:
         return own, np.where(scaled - own < 0.5, own - 1.0, own + 1.0)
 
 
-def _hash(cells: list[F64]) -> U64:
+def _hash_cells(cells: list[F64]) -> U64:
     """Mix the bits of the cells, [n] per axis. A collision only costs a comparison."""
     mixed = np.zeros(len(cells[0]), np.uint64)
     for cell in cells:
         mixed ^= (cell + 0.0).view(np.uint64)  # -0 becomes 0
-        mixed *= _MIX
-        mixed ^= mixed >> np.uint64(29)
+        mixed *= _HASH_FACTOR
+        mixed ^= mixed >> _HASH_SHIFT
     return mixed
 
 
@@ -140,44 +153,59 @@ def _search_grid(
     candidates_max: int,
     rows: I64,
 ) -> I64:
+    """Search partners of the decoded splats `rows`, [n], in one grid.
+
+    Args:
+        grid: the source splats.
+        source: M splats.
+        decoded: N splats with the origin of `source`.
+        bounds: largest error by measure, with its tolerance.
+        candidates_max: see `find_partners`.
+        rows: [n], decoded splats.
+
+    Returns:
+        [n] index of a source splat within the bounds, `UNMATCHED` or `UNDECIDED`.
+    """
     partners = np.full(len(rows), UNMATCHED, np.int64)
     cells = grid.cells(decoded, rows)
+    # Bit a of a probe selects the neighbour along axis a instead of the own cell.
     for probe in range(1 << _AXES):
-        left = np.flatnonzero(partners == UNMATCHED)
-        if not len(left):
+        open_rows = np.flatnonzero(partners == UNMATCHED)
+        if not len(open_rows):
             break
-        keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
+        keys = _hash_cells([pair[probe >> axis & 1][open_rows] for axis, pair in enumerate(cells)])
         order = np.argsort(keys)  # halves the time, because neighbouring keys are then adjacent in memory
-        left, keys = left[order], keys[order]
+        open_rows, keys = open_rows[order], keys[order]
         slots = np.searchsorted(grid.keys, keys)
+        # Equal keys are adjacent: in round n, each splat is compared with its candidate n.
         for nth in range(candidates_max + 1):
             more = (slots < len(grid.keys)) & (grid.keys[np.minimum(slots, len(grid.keys) - 1)] == keys)
-            left, keys, slots = left[more], keys[more], slots[more]
-            if not len(left):
+            open_rows, keys, slots = open_rows[more], keys[more], slots[more]
+            if not len(open_rows):
                 break
             if nth == candidates_max:
-                partners[left] = UNDECIDED
+                partners[open_rows] = UNDECIDED
                 break
             candidates = grid.order[slots]
-            good = _pairs_within(source, decoded, candidates, rows[left], bounds)
-            partners[left[good]] = candidates[good]
-            left, keys, slots = left[~good], keys[~good], slots[~good] + 1
+            within = _pairs_within(source, decoded, candidates, rows[open_rows], bounds)
+            partners[open_rows[within]] = candidates[within]
+            open_rows, keys, slots = open_rows[~within], keys[~within], slots[~within] + 1
     return partners
 
 
 def _pairs_within(
     source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
-    """Return [n] bool, which pairs are within the bounds. SH and covariance are compared only if the rest is."""
-    good = np.ones(len(source_rows), bool)
+    """Return [n] bool, True for pairs within the bounds. SH and covariance are compared only if the rest is."""
+    within = np.ones(len(source_rows), bool)
     for names in (_FIRST, bounds.keys() - _FIRST):
-        pairs = np.flatnonzero(good)
+        pairs = np.flatnonzero(within)
         for start in range(0, len(pairs), _PAIR_BLOCK):
             part = pairs[start : start + _PAIR_BLOCK]
             errors = pair_differences(source, decoded, source_rows[part], decoded_rows[part], names)
             for name, values in errors.items():
-                good[part] &= reduce(np.maximum, np.abs(values).T) <= bounds[name]
-    return good
+                within[part] &= reduce(np.maximum, np.abs(values).T) <= bounds[name]
+    return within
 
 
 def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
@@ -191,5 +219,5 @@ def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
         rows = slice(tile.start, tile.start + tile.splat_count)
         x, y, z = np.abs(decoded.means[rows].T)  # NumPy is slow along an axis of three
         largest = np.maximum(np.maximum(x, y), z).astype(np.float64)
-        radii[rows] = 0.87 * math.ldexp(step, tile.exponent) + largest * 2.0**-22
+        radii[rows] = _HALF_DIAGONAL * math.ldexp(step, tile.exponent) + largest * _ROUNDING
     return radii

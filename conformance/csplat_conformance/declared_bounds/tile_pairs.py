@@ -29,6 +29,8 @@ from csplat_conformance.declared_bounds.measurement import (
 
 _COMPARE_FACTOR = 2.2  # memory to compare two scenes, as a multiple of their arrays
 _SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, order, centres in doubles
+_FLOAT_BYTES = 4
+_GEOMETRY_FLOATS = 11  # per splat: centre, quaternion, scales and opacity
 _BASE_BYTES = 200_000_000  # bytes of the program, of blocks of the source, and of tiles during decoding
 
 
@@ -52,7 +54,9 @@ def splats_in_memory(opened: SplatFile, memory_bytes: int) -> int:
 
 
 def _splat_bytes(opened: SplatFile) -> int:
-    return 4 * (11 + 3 * (opened.sh_degree + 1) ** 2) + sum(dtype.itemsize for dtype in opened.extra.values())
+    """Return the bytes of a splat in arrays of float32 and in extra columns."""
+    float_count = _GEOMETRY_FLOATS + 3 * (opened.sh_degree + 1) ** 2
+    return _FLOAT_BYTES * float_count + sum(dtype.itemsize for dtype in opened.extra.values())
 
 
 def measure_pairs_by_tile(
@@ -79,10 +83,10 @@ def measure_pairs_by_tile(
     """
     check_source_index(source_index, scene.count, opened.count)
     names = [name for name in opened.extra if name in scene.extra]
-    groups = list(_groups(opened.header, splats_max)) or [[]]
+    groups = list(_group_tiles(opened.header, splats_max)) or [[]]
     parts, lines, reach = [], {}, 0.0
     for number, tiles in enumerate(groups):
-        report = partial(_report_part, context.progress, number, len(groups))
+        report = partial(_report_group, context.progress, number, len(groups))
         start = tiles[0].start if tiles else 0
         rows = source_index[start : start + sum(tile.splat_count for tile in tiles)]
         order = np.argsort(rows)
@@ -94,23 +98,25 @@ def measure_pairs_by_tile(
             block = replace(block, extra={name: block.extra[name] for name in names})
             blocks.append(block.select(ascending[first:end] - place.start))
         source = Source.concatenate(blocks) if blocks else Source.of(scene.empty())
+        # positions[i]: row in `source`, whose rows are in ascending order, of the source splat of splat start + i.
         positions = np.empty(len(order), np.int64)
         positions[order] = np.arange(len(order))
         models = opened.models([tile.index for tile in tiles]) if tiles else [opened.empty()]
         for decoded in models:
-            own, positions = np.split(positions, [len(decoded)])
-            parts.append((start, len(decoded), measure_pairs(source, decoded, own, context=context)))
-            lines.update(dict.fromkeys(find_wrong_extras(source, decoded, own)))
+            tile_positions, positions = np.split(positions, [len(decoded)])
+            parts.append((start, len(decoded), measure_pairs(source, decoded, tile_positions, context=context)))
+            lines.update(dict.fromkeys(find_wrong_extras(source, decoded, tile_positions)))
             start += len(decoded)
     return PairErrors(merge_errors(parts), list(lines), reach)
 
 
-def _report_part(progress: Progress, number: int, count: int, stage: str, share: float) -> None:
-    progress(stage, (number + share) / count)
+def _report_group(progress: Progress, number: int, count: int, stage: str, done: float) -> None:
+    """Report a fraction of group `number` of `count` as a fraction of all groups."""
+    progress(stage, (number + done) / count)
 
 
-def _groups(header: SceneHeader, splats_max: int) -> Iterator[list[Tile]]:
-    """Yield groups of successive tiles with at most `splats_max` splats, or with a single tile."""
+def _group_tiles(header: SceneHeader, splats_max: int) -> Iterator[list[Tile]]:
+    """Yield groups of successive tiles with at most `splats_max` splats; a larger tile is a group of its own."""
     group: list[Tile] = []
     for tile in header.tiles:
         if group and sum(member.splat_count for member in group) + tile.splat_count > splats_max:

@@ -131,7 +131,7 @@ def ordinary_inputs() -> list[EncoderInput]:
         rows_input(
             "ordinary/obj_info", "obj_info lines, which are like comments", few, PlyLayout(obj_info=("num 64", ""))
         ),
-        rows_input("ordinary/extra_columns", "columns that splats do not use", _with_extra),
+        rows_input("ordinary/extra_columns", "columns that splats do not use", _with_extra_columns),
         rows_input("ordinary/quaternions", "lengths from 0.001 to 1000, negative w and w of −0", _long_quats),
         rows_input(
             "ordinary/transparent_and_opaque", "logits from −200 to 200: alpha 0, denormal, 1", _transparent_and_opaque
@@ -146,19 +146,21 @@ def ordinary_inputs() -> list[EncoderInput]:
             separation=10.0,
             renders=False,
         ),
-        rows_input("ordinary/all_alike", "the same size, rotation, opacity and base colour for all splats", _uniform),
+        rows_input("ordinary/all_alike", "the same size, rotation, opacity and base colour for all splats", _all_alike),
         rows_input("ordinary/strong_colours", "coefficients of ±20", _strong_colours),
         rows_input("ordinary/two_tiles", f"{_MANY} splats, more than a tile holds", lambda: cloud(_MANY, 0, 3)),
     ]
 
 
 def _with_normals() -> PlyRows:
+    """Return splats with normals of any length, which encoders may drop or keep."""
     splats = cloud(64, 1, 10)
     splats.normals = np.random.default_rng(10).normal(0.0, 1.0, (64, 3)).astype(np.float32)
     return splats
 
 
-def _with_extra() -> PlyRows:
+def _with_extra_columns() -> PlyRows:
+    """Return splats with extra columns of a signed, an unsigned and a floating-point type."""
     splats, rng = cloud(64, 1, 11), np.random.default_rng(11)
     splats.extra = {
         "object_id": rng.integers(-5, 5, 64).astype("<i4"),
@@ -169,6 +171,7 @@ def _with_extra() -> PlyRows:
 
 
 def _long_quats() -> PlyRows:
+    """Return splats with quaternions scaled by 0.001 to 1000, some with negative w or with components of −0."""
     splats, rng = cloud(125, 0, 12), np.random.default_rng(12)
     splats.quats *= (10.0 ** rng.uniform(-3.0, 3.0, (125, 1))).astype(np.float32)
     splats.quats[:60, 0] = -np.abs(splats.quats[:60, 0])
@@ -178,6 +181,7 @@ def _long_quats() -> PlyRows:
 
 
 def _transparent_and_opaque() -> PlyRows:
+    """Return splats with logits from −40 to 40, and in every eighth row from −200 to 200."""
     splats = cloud(125, 0, 13)
     splats.logits = np.linspace(-40.0, 40.0, 125).astype(np.float32)
     # In binary32, alpha is subnormal below −87.3, 0 below −104, and 1 above 17.3.
@@ -186,6 +190,7 @@ def _transparent_and_opaque() -> PlyRows:
 
 
 def _needles() -> PlyRows:
+    """Return splats with a random axis that is long in every other splat, a needle, and short in the rest, discs."""
     splats, rng = cloud(125, 1, 14), np.random.default_rng(14)
     thin = np.log(np.float32(PITCH * 5e-4))
     long = rng.integers(0, 3, 125)
@@ -198,6 +203,7 @@ def _needles() -> PlyRows:
 
 
 def _plane() -> PlyRows:
+    """Return splats on a jitterless grid with z = 0.7."""
     splats = cloud(125, 0, 15)
     side = 12
     grid = np.stack(np.unravel_index(np.arange(125), (side, side)), axis=1) * PITCH
@@ -206,12 +212,14 @@ def _plane() -> PlyRows:
 
 
 def _elongated() -> PlyRows:
+    """Return splats at steps of 10 along y, which spread by less than a unit along x and z."""
     splats = cloud(216, 1, 17)
     splats.means[:, 1] = np.arange(216) * np.float32(10.0)
     return splats
 
 
-def _uniform() -> PlyRows:
+def _all_alike() -> PlyRows:
+    """Return splats that differ only in their centres and in the bands above 0."""
     splats = cloud(216, 2, 18)
     for array in (splats.quats, splats.scales, splats.logits, splats.sh0):
         array[:] = array[0]
@@ -219,6 +227,7 @@ def _uniform() -> PlyRows:
 
 
 def _strong_colours() -> PlyRows:
+    """Return splats of which some have 20 times the base colour, some 40 times the other coefficients."""
     splats = cloud(125, 2, 16)
     splats.sh0[::7] *= 20.0
     splats.shN[::11] *= 40.0
@@ -259,10 +268,12 @@ def unusual_value_inputs() -> list[EncoderInput]:
             "nasty/tiny_and_huge_quaternions", "lengths of 1e−45 to 6e38, with squares beyond binary32", _extreme_quats
         ),
         rows_input("nasty/huge_scales", "logarithms of ±60", _huge_scales, renders=False),
-        rows_input("nasty/scales_beyond_88", "logarithms beyond ±88, which count as ±88", _scales_88, renders=False),
+        rows_input(
+            "nasty/scales_beyond_88", "logarithms beyond ±88, which count as ±88", _scales_beyond_88, renders=False
+        ),
         rows_input("nasty/scales_of_float", "logarithms of ±1e4 and ±3e38", _scales_of_float, renders=False),
         rows_input("nasty/needles", "one axis 1e5 to 1e30 times the others", _extreme_needles, renders=False),
-        rows_input("nasty/far_coordinates", "centres about 1,000,000", _far, separation=30.0),
+        rows_input("nasty/far_coordinates", "centres about 1,000,000", _far_coordinates, separation=30.0),
         rows_input(
             "nasty/far_doubles",
             "centres about 4,000,000 in doubles, not exact in binary32 relative to any origin",
@@ -271,11 +282,14 @@ def unusual_value_inputs() -> list[EncoderInput]:
         ),
         rows_input("nasty/outlier", "one splat 100,000 times farther than the others", _outlier, renders=False),
         rows_input(
-            "nasty/edge_of_float", "one centre at 3e38 and −3e38, near the limit of binary32", _edge, renders=False
+            "nasty/edge_of_float",
+            "one centre at 3e38 and −3e38, near the limit of binary32",
+            _edge_of_float,
+            renders=False,
         ),
         rows_input("nasty/duplicates", "every third splat four times", _duplicates),
         rows_input("nasty/one_place", "one splat 20,000 times", _one_place, renders=False),
-        rows_input("nasty/tiny_scene", "a scene of a millionth of a unit", _tiny, separation=SEPARATION * 1e-6),
+        rows_input("nasty/tiny_scene", "a scene of a millionth of a unit", _tiny_scene, separation=SEPARATION * 1e-6),
         rows_input("nasty/huge_colours", "coefficients of ±1e6 next to small ones", _huge_colours, renders=False),
         rows_input("nasty/not_a_number", "NaN in three rows", _with_nan, renders=False),
         rows_input(
@@ -285,18 +299,23 @@ def unusual_value_inputs() -> list[EncoderInput]:
             "nasty/infinite_scales", "scales of ±infinity: three rows are flat, one is no splat", _infinite_scales
         ),
         rows_input(
-            "nasty/beyond_float", "doubles beyond binary32: two rows are not splats", _beyond, PlyLayout(dtype="f8")
+            "nasty/beyond_float",
+            "doubles beyond binary32: two rows are not splats",
+            _beyond_float,
+            PlyLayout(dtype="f8"),
         ),
     ]
 
 
 def _infinite_logits() -> PlyRows:
+    """Return splats of which a third has alpha 1 and a third alpha 0."""
     splats = cloud(64, 0, 21)
     splats.logits[::3], splats.logits[1::3] = np.inf, -np.inf
     return splats
 
 
 def _zero_quats() -> PlyRows:
+    """Return splats of which every fifth has a quaternion of zeros, half of these with a −0."""
     splats = cloud(64, 0, 22)
     splats.quats[::5] = 0.0
     splats.quats[::10, 2] = -0.0
@@ -304,6 +323,7 @@ def _zero_quats() -> PlyRows:
 
 
 def _extreme_quats() -> PlyRows:
+    """Return splats with quaternions whose squares overflow or vanish in binary32."""
     splats = cloud(64, 0, 32)
     factors = np.array([1e-30, 1e30, 1e-38, 1e37, 1e-20, 1e20, 1e-10, 1e10], np.float32)
     splats.quats[:56] *= np.repeat(factors, 7)[:, None]
@@ -313,12 +333,13 @@ def _extreme_quats() -> PlyRows:
 
 
 def _huge_scales() -> PlyRows:
+    """Return splats of which three have logarithms of ±60."""
     splats = cloud(64, 0, 23)
     splats.scales[0], splats.scales[1], splats.scales[2] = 60.0, -60.0, (60.0, 0.0, -60.0)
     return splats
 
 
-def _scales_88() -> PlyRows:
+def _scales_beyond_88() -> PlyRows:
     """Put all scales of half of the splats beyond ±88, so that their errors are 0 for any stored scales beyond it."""
     splats = cloud(64, 0, 33)
     ends = np.array([88.0, 88.5, 88.7229, 89.0, 104.0], np.float32)
@@ -329,6 +350,7 @@ def _scales_88() -> PlyRows:
 
 
 def _scales_of_float() -> PlyRows:
+    """Return splats with scales whose exponentials overflow or vanish even in binary64."""
     splats = cloud(64, 0, 33)
     ends = np.array([1e4, 3e38], np.float32)
     splats.scales[:2, 0], splats.scales[2:4, 1] = ends, -ends
@@ -337,6 +359,7 @@ def _scales_of_float() -> PlyRows:
 
 
 def _extreme_needles() -> PlyRows:
+    """Return needles with a random long axis, 1e30 times the others in every eighth splat, 1e5 times in the rest."""
     splats, rng = cloud(64, 0, 34), np.random.default_rng(34)
     long = rng.integers(0, 3, 64)
     ratio = np.where(np.arange(64) % 8, 1e5, 1e30)
@@ -345,7 +368,8 @@ def _extreme_needles() -> PlyRows:
     return splats
 
 
-def _far() -> PlyRows:
+def _far_coordinates() -> PlyRows:
+    """Return a cloud a thousand times as large around (1e6, −1e6, 1e6)."""
     splats = cloud(64, 0, 24)
     splats.means = (splats.means.astype(np.float64) * 1000.0 + [1e6, -1e6, 1e6]).astype(np.float32)
     splats.scales += np.float32(np.log(1000.0))
@@ -353,6 +377,7 @@ def _far() -> PlyRows:
 
 
 def _far_doubles() -> PlyRows:
+    """Return splats far from 0, with low bits that binary32 cannot represent relative to any of the centres."""
     splats, rng = cloud(216, 1, 35), np.random.default_rng(35)
     low_bits = rng.uniform(-1e-8, 1e-8, (216, 3))
     splats.means = splats.means.astype(np.float64) + np.array((500_123.4, 4_012_345.6, -123.4)) + low_bits
@@ -360,18 +385,21 @@ def _far_doubles() -> PlyRows:
 
 
 def _outlier() -> PlyRows:
+    """Return splats with one centre at a distance of 1.4e5."""
     splats = cloud(125, 0, 25)
     splats.means[77] = (1e5, 0.0, -1e5)
     return splats
 
 
-def _edge() -> PlyRows:
+def _edge_of_float() -> PlyRows:
+    """Return splats with one centre near the largest binary32."""
     splats = cloud(125, 0, 36)
     splats.means[77] = (3e38, 0.0, -3e38)
     return splats
 
 
 def _duplicates() -> PlyRows:
+    """Return splats of which every third row occurs four times."""
     splats = cloud(64, 1, 26)
     return splats.select(np.repeat(np.arange(64), np.where(np.arange(64) % 3, 1, 4)))
 
@@ -380,7 +408,8 @@ def _one_place() -> PlyRows:
     return cloud(1, 1, 37).select(np.zeros(20_000, np.intp))
 
 
-def _tiny() -> PlyRows:
+def _tiny_scene() -> PlyRows:
+    """Return a cloud shrunk to a millionth."""
     splats = cloud(64, 0, 27)
     splats.means *= np.float32(1e-6)
     splats.scales += np.float32(np.log(1e-6))
@@ -388,6 +417,7 @@ def _tiny() -> PlyRows:
 
 
 def _huge_colours() -> PlyRows:
+    """Return splats of which four have coefficients of ±1e6."""
     splats = cloud(64, 1, 28)
     splats.sh0[3], splats.sh0[4], splats.shN[5] = 1e6, -1e6, 1e6
     splats.sh0[6] = (1e6, -1e6, 1e6)  # large chroma; the rows above are grey
@@ -395,24 +425,28 @@ def _huge_colours() -> PlyRows:
 
 
 def _with_nan() -> PlyRows:
+    """Return splats with three rows that contain a NaN each."""
     splats = cloud(64, 1, 29)
     splats.means[3, 1], splats.logits[17], splats.shN[40, 2, 2] = np.nan, np.nan, np.nan
     return splats
 
 
 def _infinities() -> PlyRows:
+    """Return splats with four rows that contain an infinity each."""
     splats = cloud(64, 1, 38)
     splats.means[3, 1], splats.quats[17, 0], splats.sh0[20, 1], splats.shN[40, 2, 2] = np.inf, -np.inf, np.inf, -np.inf
     return splats
 
 
 def _infinite_scales() -> PlyRows:
+    """Return splats with three flat rows, scales of −infinity, and one invalid row."""
     splats = cloud(64, 1, 39)
     splats.scales[5:7, 2], splats.scales[30], splats.scales[50, 0] = -np.inf, -np.inf, np.inf
     return splats
 
 
-def _beyond() -> PlyRows:
+def _beyond_float() -> PlyRows:
+    """Return splats with one centre and one colour that are finite in binary64 but not in binary32."""
     splats = cloud(64, 1, 40)
     splats.means, splats.sh0 = splats.means.astype(np.float64), splats.sh0.astype(np.float64)
     splats.means[9, 0], splats.sh0[33, 2] = 1e39, -1e300
@@ -431,7 +465,9 @@ def unusual_inputs() -> list[EncoderInput]:
     few = lambda: cloud(64, 1, 41)  # noqa: E731 - shared by several inputs
     lists = [bytes(range(row % 4)) for row in range(64)]
     return [
-        rows_input("nasty/face_first", "elements before the splats, one with rows of variable length", few, _first()),
+        rows_input(
+            "nasty/face_first", "elements before the splats, one with rows of variable length", few, _face_first()
+        ),
         rows_input("nasty/camera_last", "an element after the splats", few, PlyLayout(after=_CAMERA)),
         rows_input(
             "nasty/list_property", "a list property of splats: rows of variable length", few, PlyLayout(lists=lists)
@@ -463,11 +499,12 @@ def unusual_inputs() -> list[EncoderInput]:
     ]
 
 
-def _first() -> PlyLayout:
+def _face_first() -> PlyLayout:
     return PlyLayout(before=((*_FACES[0], *_CAMERA[0]), _FACES[1] + _CAMERA[1]))
 
 
 def _nan_normals() -> PlyRows:
+    """Return splats with normals that are NaN or infinite in some rows."""
     splats = cloud(64, 1, 43)
     splats.normals = np.zeros((64, 3), np.float32)
     splats.normals[5:20], splats.normals[30:33] = np.nan, -np.inf
@@ -475,6 +512,7 @@ def _nan_normals() -> PlyRows:
 
 
 def _nan_extra() -> PlyRows:
+    """Return splats with an extra column that is NaN in every fifth row."""
     splats = cloud(64, 1, 44)
     splats.extra = {"confidence": np.where(np.arange(64) % 5, 0.5, np.nan).astype("<f4")}
     return splats
@@ -510,12 +548,14 @@ def invalid_inputs() -> list[EncoderInput]:
 
 
 def _point_cloud() -> bytes:
+    """Return a PLY of nine points with coordinates only."""
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 9\n"
     head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     return head.encode("ascii") + np.arange(27, dtype="<f4").tobytes()
 
 
 def _word_for_number() -> bytes:
+    """Return an ASCII PLY with a word as the last value of one row."""
     lines = write_ply(cloud(64, 1, 31), PlyLayout(format="ascii")).split(b"\n")
     lines[-9] = b" ".join([*lines[-9].split()[:-1], b"mean"])
     return b"\n".join(lines)

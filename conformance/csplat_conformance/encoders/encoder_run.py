@@ -50,8 +50,8 @@ def failed_verdict(wrong: list[Defect], details: dict[str, Any]) -> Verdict:
 
 def join_lines(lines: tuple[str, ...]) -> str:
     """Join the first lines into a single line, and add the number of remaining lines."""
-    rest = f"; and {len(lines) - _LINES_MAX} more" if len(lines) > _LINES_MAX else ""
-    return "; ".join(lines[:_LINES_MAX]) + rest
+    remainder = f"; and {len(lines) - _LINES_MAX} more" if len(lines) > _LINES_MAX else ""
+    return "; ".join(lines[:_LINES_MAX]) + remainder
 
 
 #: Runs a command line in this process; called with the line, its values and the time limit, seconds.
@@ -120,11 +120,11 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
     else:
         with temporary_folder() as cwd:
             end = run_program(command, named, seconds, cwd=cwd)
-            traces += [f"left {name} in its working directory" for name in _names(cwd)]
+            traces += [f"left {name} in its working directory" for name in _list_folder(cwd)]
     # A refusal that leaves an output is reported by `check_end`.
     outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if end.returncode == 0 else set())
-    left = [name for name in _names(folder) if name not in outputs]
-    traces = [*_input_changes(paths["ply"], ply), *(f"left {name} next to the output" for name in left), *traces]
+    strays = [name for name in _list_folder(folder) if name not in outputs]
+    traces = [*_find_input_changes(paths["ply"], ply), *(f"left {name} next to the output" for name in strays), *traces]
     return EncoderRun(end, paths["out"], paths.get("index"), tuple(traces), started)
 
 
@@ -132,12 +132,13 @@ def _has_placeholder(command: str, name: str) -> bool:
     return f"{{{name}}}" in command
 
 
-def _names(folder: Path) -> list[str]:
+def _list_folder(folder: Path) -> list[str]:
+    """Return the sorted names of the entries of a folder; none if it does not exist."""
     return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
 
 
-def _input_changes(path: Path, content: bytes) -> list[str]:
-    """Return a line if the input was changed."""
+def _find_input_changes(path: Path, content: bytes) -> list[str]:
+    """Return a line if the file at `path` was removed or no longer has its `content`."""
     try:
         return [] if path.read_bytes() == content else ["the input was modified"]
     except OSError:
@@ -159,6 +160,7 @@ def check_end(case: EncoderInput, run: EncoderRun) -> Verdict | None:
 
 
 def _check_refusal(case: EncoderInput, run: EncoderRun) -> Verdict:
+    """Judge exit status 1: it needs a reason in one line, no file, and an input that may be refused."""
     end = run.end
     if _TRACEBACK in end.stderr:
         return Verdict(Status.CRASHED, _with_line("a traceback", end))
@@ -175,11 +177,13 @@ def _check_refusal(case: EncoderInput, run: EncoderRun) -> Verdict:
 
 
 def _last_line(end: ProcessEnd) -> str:
+    """Return the last line of standard error or, if that is empty, of standard output; empty without output."""
     text = (end.stderr.strip() or end.stdout.strip()).decode("utf-8", "replace")
     return text.splitlines()[-1].strip()[:_LINE_MAX] if text else ""
 
 
 def _with_line(message: str, end: ProcessEnd) -> str:
+    """Append the program's last line to a message, if it printed any."""
     line = _last_line(end)
     return f"{message}; its last line: {line}" if line else message
 
@@ -204,7 +208,7 @@ def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defec
     if data != repeated:
         at = _first_difference(data, repeated)
         sizes = "" if len(data) == len(repeated) else f" ({len(data):,} and {len(repeated):,} bytes)"
-        where = _field_at(data, at)
+        where = _name_field_at(data, at)
         text = f"two runs gave different files{sizes}: first at byte {at}{f', in {where}' if where else ''}"
         wrong.append(("CNF-10", text))
     elif first.index is not None and again.index is not None and _index_bytes(first) != _index_bytes(again):
@@ -217,13 +221,14 @@ def _index_bytes(run: EncoderRun) -> bytes | None:
 
 
 def _first_difference(first: bytes, second: bytes) -> int:
+    """Return the offset of the first difference: the shorter size if one is the beginning of the other."""
     for at, (a, b) in enumerate(zip(first, second, strict=False)):
         if a != b:
             return at
     return min(len(first), len(second))
 
 
-def _field_at(data: bytes, at: int) -> str:
+def _name_field_at(data: bytes, at: int) -> str:
     """Return the name of the field or the chunk at an offset; empty if the file cannot be read."""
     try:
         fields, spans = read_fields(data)

@@ -106,7 +106,7 @@ def run_encoder(
     with _work_folder(options.keep) as folder, ThreadPoolExecutor(options.jobs or os.cpu_count() or 1) as pool:
         try:
             steps = _StepCounter(2 * len(inputs), progress)
-            firsts, repeated = _run_all(pool, command, inputs, folder, options.timeout_seconds, run, steps)
+            firsts, repeated = _run_inputs(pool, command, inputs, folder, options.timeout_seconds, run, steps)
             for case, first, future in zip(inputs, firsts, repeated, strict=True):
                 # One input at a time: rendering uses all cores by itself.
                 again = future.result() if future is not None else None
@@ -118,7 +118,7 @@ def run_encoder(
                 steps.advance()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    notes = _declined_notes(declined)
+    notes = _summarise_declined(declined)
     if render_score is None and "L4" in options.levels and inputs:
         notes.append(f"L4 SKIPPED: {no_render_reason}")
     extra = (Status.WARNED, Status.DECLINED, Status.NOT_PROVED)
@@ -172,7 +172,7 @@ def select_inputs(pattern: str | None) -> list[EncoderInput]:
 def _check_input_safely(
     case: EncoderInput, first: EncoderRun, again: EncoderRun | None, checks: CheckOptions
 ) -> list[Outcome]:
-    """Check an input; a file that cannot be read or rendered fails only this input."""
+    """Check an input; if a file cannot be read or rendered, the level after the last outcome fails."""
     outcomes: list[Outcome] = []
     try:
         outcomes.extend(check_input(case, first, again, checks))
@@ -184,6 +184,7 @@ def _check_input_safely(
 
 @contextmanager
 def _work_folder(keep: Path | None) -> Iterator[Path]:
+    """Yield the folder `keep`, which is created if necessary, or a temporary folder for `None`."""
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
         yield keep.absolute()
@@ -193,12 +194,19 @@ def _work_folder(keep: Path | None) -> Iterator[Path]:
 
 
 def _input_folder(folder: Path, case: EncoderInput) -> Path:
+    """Return the folder of an input's first run; it need not exist."""
     return folder / case.name.replace("/", "-")
 
 
 @dataclass
 class _StepCounter:
-    """A counter of the steps of a run."""
+    """A counter of the steps of a run.
+
+    Attributes:
+        count: number of steps.
+        progress: called with `done` and `count` after each step; `None` for no reports.
+        done: number of steps that are done.
+    """
 
     count: int
     progress: Callable[[int, int], None] | None
@@ -211,7 +219,7 @@ class _StepCounter:
             self.progress(self.done, self.count)
 
 
-def _run_all(
+def _run_inputs(
     pool: ThreadPoolExecutor,
     command: str,
     inputs: Sequence[EncoderInput],
@@ -220,31 +228,44 @@ def _run_all(
     run: CommandRunner | None,
     steps: _StepCounter,
 ) -> tuple[list[EncoderRun], list[Future[EncoderRun] | None]]:
-    """Run all inputs, then repeat the runs that wrote a file."""
+    """Run all inputs, then start the repetitions of the runs that wrote a file.
 
-    def again(case: EncoderInput, first: EncoderRun) -> EncoderRun:
+    Args:
+        pool: runs the commands.
+        command: see `run_encoder`.
+        inputs: the inputs.
+        folder: folder of the files, one subfolder per run.
+        seconds: time limit of each run.
+        run: runs a command line in this process; `None` for a process each, which is repeated after `REPEAT_SECONDS`.
+        steps: counts the first runs.
+
+    Returns:
+        The first run of each input, and its repetition, which may still be running; `None` if no file was written.
+    """
+
+    def repeat(case: EncoderInput, first: EncoderRun) -> EncoderRun:
         if run is None:
             time.sleep(max(0.0, first.started + REPEAT_SECONDS - time.monotonic()))
         first_folder = _input_folder(folder, case)
         return run_once(command, case, first_folder.with_name(first_folder.name + _REPEATED), seconds, run)
 
-    begun = [pool.submit(run_once, command, case, _input_folder(folder, case), seconds, run) for case in inputs]
+    futures = [pool.submit(run_once, command, case, _input_folder(folder, case), seconds, run) for case in inputs]
     firsts = []
-    for future in begun:
+    for future in futures:
         firsts.append(future.result())
         steps.advance()
     pairs = zip(inputs, firsts, strict=True)
-    return firsts, [pool.submit(again, case, first) if first.wrote else None for case, first in pairs]
+    return firsts, [pool.submit(repeat, case, first) if first.wrote else None for case, first in pairs]
 
 
 def _remove_repetition(folder: Path, case: EncoderInput, first: EncoderRun, again: EncoderRun | None) -> None:
-    """Remove a repetition if it gave the same file."""
+    """Remove the folder of a repetition if it gave the same file."""
     if again is not None and again.wrote and first.out.read_bytes() == again.out.read_bytes():
         first_folder = _input_folder(folder, case)
         shutil.rmtree(first_folder.with_name(first_folder.name + _REPEATED))
 
 
-def _declined_notes(declined: dict[str, bool]) -> list[str]:
+def _summarise_declined(declined: dict[str, bool]) -> list[str]:
     """Return a line with the number of declined inputs for each group, as a warning if all were declined."""
     notes = []
     for group in dict.fromkeys(name.partition("/")[0] for name in declined):
@@ -290,38 +311,43 @@ def check_input(
         facts = (verdict.clauses, verdict.code, verdict.message, seconds, verdict.details)
         return Outcome(case.name, level, verdict.status, *facts)
 
-    for level, verdict in _check_levels(case, first, again, checks):
+    for level, verdict in _check_by_level(case, first, again, checks):
         if level in checks.levels or (level == "L4" and verdict.status is not Status.SKIPPED):
             yield outcome(level, verdict, first.end.seconds if level == "L1" else 0.0)
 
 
-def _check_levels(
+def _check_by_level(
     case: EncoderInput, first: EncoderRun, again: EncoderRun | None, checks: CheckOptions
 ) -> Iterator[tuple[str, Verdict]]:
-    def skipped(why: str) -> Iterator[tuple[str, Verdict]]:
+    """Yield each level with its verdict; without a file, a valid L1 and a source, the others are skipped.
+
+    An input that must be refused has only L1. See `check_input` for the arguments.
+    """
+
+    def skip_others(why: str) -> Iterator[tuple[str, Verdict]]:
         return ((level, Verdict(Status.SKIPPED, why)) for level in LEVELS[1:] if not case.must_refuse)
 
     end = check_end(case, first)
     if end is not None:
         yield "L1", end
-        yield from skipped("no file was written" if end.status in (Status.PASSED, Status.DECLINED) else "L1 failed")
+        yield from skip_others("no file was written" if end.status in (Status.PASSED, Status.DECLINED) else "L1 failed")
         return
     data = first.out.read_bytes()
     stream, scene = check_stream(data)
     wrong = find_side_effects(first, again) if stream.status is Status.PASSED else []
     yield "L1", failed_verdict(wrong, stream.details) if wrong else stream
     if scene is None or case.source is None:
-        yield from skipped("L1 failed")
+        yield from skip_others("L1 failed")
         return
     content, pairs = check_content(case, case.source(), scene, first.index)
     yield "L2", content
-    errors, alone = check_errors(case, scene, pairs)
+    errors, render_reason = check_errors(case, scene, pairs)
     yield "L3", errors
-    yield "L4", _check_renders(case, scene, pairs, data, alone if "L3" in checks.levels else "", checks)
+    yield "L4", _check_renders(case, scene, pairs, data, render_reason if "L3" in checks.levels else "", checks)
 
 
 def _check_renders(
-    case: EncoderInput, scene: DecodedScene, pairs: SplatPairs, data: bytes, alone: str, checks: CheckOptions
+    case: EncoderInput, scene: DecodedScene, pairs: SplatPairs, data: bytes, render_reason: str, checks: CheckOptions
 ) -> Verdict:
     """Check L4, if it is requested or needed.
 
@@ -330,21 +356,22 @@ def _check_renders(
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
         data: the file.
-        alone: the reason why only renders can check the file; empty if errors were verified.
+        render_reason: the reason why only renders can check the file; empty if errors were verified.
         checks: the checks to make.
     """
     if not case.renders or case.source is None:
         return Verdict(Status.SKIPPED, "renders of this scene are not informative")
-    if not (alone or "L4" in checks.levels):
+    if not (render_reason or "L4" in checks.levels):
         return Verdict(Status.SKIPPED)
     if checks.render_score is not None:
         return check_renders(case, case.source(), scene, pairs, data, checks.render_score, checks.psnr_min)
-    if alone:
-        return Verdict(Status.FAILED, f"{alone}: only renders can check it, and {checks.no_render_reason}")
+    if render_reason:
+        return Verdict(Status.FAILED, f"{render_reason}: only renders can check it, and {checks.no_render_reason}")
     return Verdict(Status.SKIPPED, checks.no_render_reason)
 
 
 def _input_json(case: EncoderInput, data: bytes) -> dict[str, Any]:
+    """Return the entry of an input, whose file has the bytes `data`, in the list of inputs."""
     return {
         "name": case.name,
         "file": f"{case.name}.ply",
@@ -355,6 +382,7 @@ def _input_json(case: EncoderInput, data: bytes) -> dict[str, Any]:
 
 
 def _expected_json(case: EncoderInput, data: bytes) -> dict[str, Any] | None:
+    """Return the facts that a file of the input must agree with; `None` if it has no source."""
     if case.source is None:
         return None
     source = case.source()

@@ -56,6 +56,8 @@ STEPS_MAX = 0.75  #: lattice steps; rounding causes 0.5, or 0.71 next to alpha 0
 ONE_SIDED = 0.95  #: fraction of the errors with one sign; 40 random signs are this one-sided once in 10^9 times
 _TRUNCATED_STEPS_MAX = 1.05  # lattice steps; truncation causes at most 1
 _VALUES_MIN = 40  # smallest number of distinct values for which signs are significant
+_SINGLE_ROUNDING, _DOUBLE_ROUNDING = 2.0**-23, 2.0**-50  # relative; at least the error of reconstructing a centre
+_NEGLIGIBLE = 1e-6  # relative size of a difference that rounding alone explains
 _ROWS_MAX = 4096  # splats to examine
 _SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between rotations that are compared
 
@@ -97,7 +99,7 @@ def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> 
     if len(scene.model) and not declared.refitted:  # refitted values differ on purpose
         names = frozenset(record.measure for record in declared.records) - coarse.keys()
         warnings += find_truncation(source, scene.model, scene.header, pairs.source_index, names)
-    message = join_lines((unverified,) * bool(unverified) + tuple(warnings))
+    message = join_lines((unverified, *warnings) if unverified else tuple(warnings))
     status = Status.NOT_PROVED if unverified else Status.WARNED if warnings else Status.PASSED
     return Verdict(status, message, details=details), why
 
@@ -108,7 +110,7 @@ def coarse_errors(case: EncoderInput, source: Source, verification: BoundsVerifi
     for measure in verification.measures:
         if measure.declared_max is None or measure.declared_rms is None:
             continue
-        bound = _coarse_bound(measure, case, source)
+        bound = _warning_threshold(measure, case, source)
         if measure.declared_max > bound:
             coarse = "coarse, or a wrong rotation" if measure.name == "covariance" else "coarse"
             what = f"an error of {measure.declared_max:.3g}, beyond {bound:.3g} is {coarse}{_worst_splat(measure)}"
@@ -120,7 +122,8 @@ def coarse_errors(case: EncoderInput, source: Source, verification: BoundsVerifi
     return lines
 
 
-def _coarse_bound(measure: MeasureVerification, case: EncoderInput, source: Source) -> float:
+def _warning_threshold(measure: MeasureVerification, case: EncoderInput, source: Source) -> float:
+    """Return the largest maximum of a measure without a warning, in its unit; see the table above."""
     if measure.name == "means":
         return MEANS_PER_SEPARATION * case.separation
     if measure.name == "covariance":
@@ -132,6 +135,7 @@ def _coarse_bound(measure: MeasureVerification, case: EncoderInput, source: Sour
 
 
 def _worst_splat(measure: MeasureVerification) -> str:
+    """Return the end of a message with the worst splat, empty if it is unknown."""
     worst = measure.worst
     return "" if worst is None else f": splat {worst.splat} (source splat {worst.source_splat})"
 
@@ -151,42 +155,46 @@ def find_truncation(
     Returns:
         A line for each attribute that shows signs of truncation.
     """
-    return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in declared]
+    return [line for measure, line in _find_truncated_attributes(source, decoded, header, index) if measure in declared]
 
 
-def _truncated_attributes(
+def _find_truncated_attributes(
     source: Source, decoded: SplatModel, header: SceneHeader, index: I64
 ) -> Iterator[tuple[str, str]]:
+    """Yield a measure and a line for each attribute that shows signs of truncation; `index` is as above."""
     for measure, steps in (
-        ("means", _mean_steps(source, decoded, header, index)),
-        ("opacities", _opacity_steps(source, decoded, header, index)),
+        ("means", _largest_mean_steps(source, decoded, header, index)),
+        ("opacities", _largest_opacity_steps(source, decoded, header, index)),
     ):
         if steps > STEPS_MAX:
             what = _TRUNCATED if steps < _TRUNCATED_STEPS_MAX else "not rounded to nearest?"
             yield measure, f"{measure}: errors up to {steps:.2f} lattice steps, expected at most 0.5: {what}"
     rows = np.linspace(0, len(decoded) - 1, min(len(decoded), _ROWS_MAX)).astype(np.int64)
-    theirs = index[rows]
+    source_rows = index[rows]
     # Axes may be permuted: compare sorted scales.
     yield from _compare_one_sided(
-        "covariance", "scales", *(np.sort(a, axis=1) for a in (source.scales[theirs], decoded.scales[rows]))
+        "covariance", "scales", *(np.sort(a, axis=1) for a in (source.scales[source_rows], decoded.scales[rows]))
     )
-    yield from _compare_one_sided("covariance", "quats", *_aligned_quats(source.quats[theirs], decoded.quats[rows]))
+    yield from _compare_one_sided("covariance", "quats", *_align_quats(source.quats[source_rows], decoded.quats[rows]))
     yield from _compare_one_sided(
-        "sh0", "sh0", *_coded_colours(source.sh0[theirs], decoded.sh0[rows], header, _spec.ATTRIBUTE_SH0)
+        "sh0", "sh0", *_select_coded_colours(source.sh0[source_rows], decoded.sh0[rows], header, _spec.ATTRIBUTE_SH0)
     )
     for band in range(1, min(decoded.sh_degree, source.sh_degree) + 1):
         coefficients = slice(band * band - 1, (band + 1) ** 2 - 1)
-        pair = source.shN[theirs, coefficients], decoded.shN[rows, coefficients]
+        pair = source.shN[source_rows, coefficients], decoded.shN[rows, coefficients]
         yield from _compare_one_sided(
-            f"sh{band}", f"sh{band}", *_coded_colours(*pair, header, _spec.ATTRIBUTE_SH0 + band)
+            f"sh{band}", f"sh{band}", *_select_coded_colours(*pair, header, _spec.ATTRIBUTE_SH0 + band)
         )
 
 
 # Steps ---------------------------------------------------------------------------------------------
 
 
-def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error along an axis in lattice steps, without rounding to binary32; `index` is [N]."""
+def _largest_mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
+    """Return the largest error of a mean along an axis in lattice steps, less what rounding to binary32 may add.
+
+    `index` is [N]. 0 without splats.
+    """
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     near, reach = source.about(decoded.origin), source.reach(decoded.origin)
     largest = 0.0
@@ -194,13 +202,13 @@ def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index:
         rows = slice(tile.start, tile.start + tile.splat_count)
         means = decoded.means[rows].astype(np.float64)
         theirs = near.means[index[rows]].astype(np.float64)
-        rounding = np.abs(means) * 2.0**-23 + reach * 2.0**-50
+        rounding = np.abs(means) * _SINGLE_ROUNDING + reach * _DOUBLE_ROUNDING
         errors = np.abs(means - theirs) - rounding
         largest = max(largest, float(errors.max(initial=0.0)) / math.ldexp(step, tile.exponent))
     return largest
 
 
-def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
+def _largest_opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
     """Return the largest error in steps of alpha, or of its root if the file's mapping is SQUARE; `index` is [N]."""
     record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
     ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
@@ -215,11 +223,14 @@ def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, ind
 def _compare_one_sided(
     measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
 ) -> Iterator[tuple[str, str]]:
-    """Yield a line if nearly all errors of two arrays of one shape have one sign."""
+    """Yield `measure` and a line about `name` if nearly all errors of two arrays of one shape have one sign.
+
+    The errors are signed or towards 0. Too few distinct values give no line.
+    """
     theirs, ours = source.astype(np.float64).ravel(), decoded.astype(np.float64).ravel()
     theirs, first = np.unique(theirs, return_index=True)
     ours = ours[first]
-    kept = (ours != 0.0) & (np.abs(ours - theirs) > 1e-6 * np.abs(theirs))
+    kept = (ours != 0.0) & (np.abs(ours - theirs) > _NEGLIGIBLE * np.abs(theirs))
     if int(kept.sum()) < _VALUES_MIN:
         return
     ours, theirs = ours[kept], theirs[kept]
@@ -230,10 +241,13 @@ def _compare_one_sided(
         yield measure, f"{name}: {100.0 * sides[side]:.0f} % of the values are {side} the source's: {_TRUNCATED}"
 
 
-def _coded_colours(
+def _select_coded_colours(
     source: NDArray[np.float32], decoded: NDArray[np.float32], header: SceneHeader, attribute: int
 ) -> tuple[F64, F64]:
-    """Return the values of [..., 3] that the encoder rounds: R, G, B, or Co and Cg. Y compensates errors."""
+    """Return what the encoder rounds of both scenes' colours, [..., 3]: R, G, B, or Co and Cg, [2, ...].
+
+    Y is left out, because it compensates errors of the other two.
+    """
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     if header.attribute(attribute).mapping != _spec.MAPPING_YCOCG:
         return theirs, ours
@@ -241,16 +255,16 @@ def _coded_colours(
 
 
 def _chroma(rgb: F64) -> F64:
+    """Return Co and Cg, [2, ...], of colours [..., 3]; 0 where their size is that of rounding errors."""
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     chroma: F64 = np.stack([r - b, g - (r + b) / 2.0])
-    # Differences of this size are rounding errors.
-    return np.where(np.abs(chroma) > 1e-6 * np.abs(rgb).max(initial=0.0), chroma, 0.0)
+    return np.where(np.abs(chroma) > _NEGLIGIBLE * np.abs(rgb).max(initial=0.0), chroma, 0.0)
 
 
-def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
+def _align_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
     """Return x, y, z of both scenes' rotations, [n, 3], the source's in the axis order and sign of the file's.
 
-    Splats whose rotations differ too much are omitted.
+    Splats whose rotations differ too much are omitted, so that n may be smaller than the number of rows.
     """
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     turned = np.einsum("nq,tqp->tnp", theirs, _AXIS_ROTATIONS)  # [24, n, 4]
@@ -264,6 +278,7 @@ def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) ->
 
 def _axis_rotations() -> F64:
     """Return the rotations that map axes to axes as right factors of quaternions, [24, 4, 4]."""
+    # Their quaternions have one, two or four components of equal magnitude, the others are 0.
     halves = [np.array(q, np.float64) for q in itertools.product((-1, 0, 1), repeat=4) if sum(map(abs, q)) in (1, 2, 4)]
     units = [q / np.sqrt(np.square(q).sum()) for q in halves if q[np.flatnonzero(q)[0]] > 0]  # −q is the same rotation
     return np.stack([_right_factor(q) for q in units])

@@ -24,7 +24,7 @@ from csplat_conformance.validator import validate
 
 _PRUNED_MAX = 0.25  # fraction of the splats; pruning more causes a warning
 _TRUNCATION = frozenset((_spec.ERROR_TRUNCATED,))
-_VIOLATIONS_MAX = 3
+_VIOLATIONS_MAX = 3  # to mention in a message
 
 
 def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
@@ -36,8 +36,8 @@ def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
     if violations:
         clauses = tuple(dict.fromkeys(violation.clause for violation in violations))
         cut = {violation.code for violation in violations} <= _TRUNCATION
-        rest = f" and {len(violations) - _VIOLATIONS_MAX} more" if len(violations) > _VIOLATIONS_MAX else ""
-        message = "; ".join(map(str, violations[:_VIOLATIONS_MAX])) + rest
+        remainder = f" and {len(violations) - _VIOLATIONS_MAX} more" if len(violations) > _VIOLATIONS_MAX else ""
+        message = "; ".join(map(str, violations[:_VIOLATIONS_MAX])) + remainder
         status = Status.PARTIAL_OUTPUT if cut else Status.FAILED
         return Verdict(status, message, clauses, violations[0].code), None
     try:
@@ -65,7 +65,11 @@ def check_content(
     centres = decoded.means.astype(np.float64) + np.subtract(decoded.origin, source.origin)
     pairs = pair_splats(source.means.astype(np.float64), centres, case.separation)
     details = {"splats": len(decoded), "source_splats": len(source), "missing": pairs.missing}
-    wrong = [*_wrong_splats(case, pairs), *_wrong_counts(source, scene, pairs), *_wrong_metadata(source, decoded)]
+    wrong = [
+        *_find_unpaired(case, pairs),
+        *_find_wrong_counts(source, scene, pairs),
+        *_find_guessed_metadata(source, decoded),
+    ]
     if index is not None:
         pairs, wrong_numbers = check_index(index, source, len(decoded), pairs)
         details["source_index"] = not wrong_numbers
@@ -80,7 +84,8 @@ def check_content(
     return Verdict(Status.PASSED, remark, details=details), pairs
 
 
-def _wrong_splats(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
+def _find_unpaired(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
+    """Return a defect for splats far from the source, and one for those near a splat that is represented already."""
     wrong = []
     if pairs.strays:
         far = f"not within {case.separation / 2.0:g} of a splat of the source"
@@ -92,12 +97,17 @@ def _wrong_splats(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
 
 
 def _count_text(count: int, first: int) -> str:
+    """Return the subject and verb of a message about `count` splats, at least 1, of which `first` is the first."""
     return (
         f"splat {first} of the file is" if count == 1 else f"{count} splats of the file, the first splat {first}, are"
     )
 
 
-def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> list[Defect]:
+def _find_wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> list[Defect]:
+    """Compare the declared counts and SH degree with the source, and the pruned count with the missing splats.
+
+    Without declared bounds, missing splats are a defect.
+    """
     declared = scene.declared_bounds
     if declared is None:
         text = f"{pairs.missing} splats of the source are missing, and the file does not declare it"
@@ -113,8 +123,8 @@ def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> lis
     return wrong
 
 
-def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
-    """Return metadata that the encoder guessed, because a PLY does not specify axes, unit and filters."""
+def _find_guessed_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
+    """Return a defect for axes, unit and flags that are set, since a PLY does not specify them, and for extra bands."""
     facts = {
         "axes": (decoded.metadata.coordinate_system, UNSPECIFIED),
         "unit_metres": (decoded.metadata.unit_metres, None),
@@ -167,9 +177,11 @@ def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tu
     return replace(pairs, source_index=index) if len(paired) == count else pairs, []
 
 
-_NONE = -1
+_NONE = -1  # index of no splat
 _CELL_MAX = 2.0**40  # cells from the origin; centres beyond share a cell, which only costs comparisons
-_MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
+_HASH_SHIFT = np.uint64(29)  # bits; brings high bits down, which a product does not
+#: Odd constants of well-mixed bits, by axis.
+_HASH_FACTORS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
 
 
 @dataclass(frozen=True)
@@ -204,13 +216,14 @@ def pair_splats(source: F64, decoded: F64, separation: float) -> SplatPairs:
         first_stray = 0 if len(decoded) else _NONE
         return SplatPairs(np.full(len(decoded), _NONE, np.int64), len(decoded), 0, len(source), (first_stray, _NONE))
     centres, member_of, counts = np.unique(source, axis=0, return_inverse=True, return_counts=True)
-    group = _nearest(centres, decoded, separation)
+    group = _find_nearest(centres, decoded, separation)
     members = np.argsort(member_of.reshape(-1), kind="stable")
     first = np.concatenate([[0], np.cumsum(counts)])
     index = np.full(len(decoded), _NONE, np.int64)
     near = np.flatnonzero(group != _NONE)
     order = near[np.argsort(group[near], kind="stable")]
     groups = group[order]
+    # The first splats near a centre are paired with the source splats at that centre; those beyond them are surplus.
     rank = np.arange(len(order)) - np.searchsorted(groups, groups, "left")
     taken = rank < counts[groups]
     index[order[taken]] = members[first[groups[taken]] + rank[taken]]
@@ -224,41 +237,41 @@ def _first_index(mask: NDArray[np.bool_]) -> int:
     return int(mask.argmax()) if mask.any() else _NONE
 
 
-def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
+def _find_nearest(centres: F64, decoded: F64, separation: float) -> I64:
     """Return [N], for each decoded centre the source centre that is nearer than half of `separation`, or −1."""
-    keys = _keys(_cells(centres, separation))
+    keys = _hash_cells(_locate_cells(centres, separation))
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
-    own = _cells(decoded, separation)
+    own = _locate_cells(decoded, separation)
     nearest = np.full(len(decoded), _NONE, np.int64)
-    left = np.arange(len(decoded))
+    open_rows = np.arange(len(decoded))  # without a source centre so far
     # A splat's own cell comes first, because it is sufficient for most splats.
     for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
-        probes = _keys(own[left] + np.array(step, np.int64))
+        probes = _hash_cells(own[open_rows] + np.array(step, np.int64))
         first, last = np.searchsorted(keys, probes, "left"), np.searchsorted(keys, probes, "right")
         # A cell has few centres, because its side is their smallest distance.
         for nth in range(int((last - first).max(initial=0))):
             more = first + nth < last
-            rows, candidates = left[more], order[first[more] + nth]
+            rows, candidates = open_rows[more], order[first[more] + nth]
             moved = decoded[rows] - centres[candidates]
-            good = np.sqrt(np.square(moved).sum(axis=1)) < separation / 2.0
-            nearest[rows[good]] = candidates[good]
-        left = left[nearest[left] == _NONE]
+            near = np.sqrt(np.square(moved).sum(axis=1)) < separation / 2.0
+            nearest[rows[near]] = candidates[near]
+        open_rows = open_rows[nearest[open_rows] == _NONE]
     return nearest
 
 
-def _cells(points: F64, side: float) -> I64:
-    """Return the cells of points, both [n, 3]."""
+def _locate_cells(points: F64, side: float) -> I64:
+    """Return the cells of points, both [n, 3]; a coordinate that is NaN is in cell 0."""
     with np.errstate(over="ignore", invalid="ignore"):
         cells = np.clip(np.floor(points / side), -_CELL_MAX, _CELL_MAX)
     result: I64 = np.nan_to_num(cells).astype(np.int64)
     return result
 
 
-def _keys(cells: I64) -> NDArray[np.uint64]:
+def _hash_cells(cells: I64) -> NDArray[np.uint64]:
     """Hash cells, [n, 3]. A collision only costs a comparison."""
     keys = np.zeros(len(cells), np.uint64)
-    for axis, factor in enumerate(_MIX):
+    for axis, factor in enumerate(_HASH_FACTORS):
         keys ^= cells[:, axis].astype(np.uint64) * factor
-        keys ^= keys >> np.uint64(29)
+        keys ^= keys >> _HASH_SHIFT
     return keys

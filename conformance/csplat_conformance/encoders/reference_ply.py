@@ -125,8 +125,8 @@ class PlyLayout:
 def write_ply(splats: PlyRows, layout: PlyLayout | None = None) -> bytes:
     """Return the bytes of a PLY."""
     layout = layout or PlyLayout()
-    columns = _columns(splats, layout)
-    head = _header_bytes(columns, len(splats.means), layout)
+    columns = _lay_out_columns(splats, layout)
+    head = _format_header(columns, len(splats.means), layout)
     if layout.format == "ascii":
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         body = "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode("ascii")
@@ -143,7 +143,8 @@ def write_ply(splats: PlyRows, layout: PlyLayout | None = None) -> bytes:
     return head + layout.before[1] + body + layout.after[1]
 
 
-def _header_bytes(columns: Mapping[str, NDArray[Any]], count: int, layout: PlyLayout) -> bytes:
+def _format_header(columns: Mapping[str, NDArray[Any]], count: int, layout: PlyLayout) -> bytes:
+    """Return the header of `count` rows up to and including the line `end_header`, with the layout's other elements."""
     lines = ["ply", f"format {layout.format} 1.0", *(f"comment {line}" for line in layout.comments)]
     lines += [f"obj_info {line}" for line in layout.obj_info]
     lines += [*layout.before[0], f"element vertex {count if layout.count is None else layout.count}"]
@@ -153,7 +154,8 @@ def _header_bytes(columns: Mapping[str, NDArray[Any]], count: int, layout: PlyLa
     return layout.line_end.join(lines).encode("utf-8", "surrogateescape")
 
 
-def _columns(splats: PlyRows, layout: PlyLayout) -> dict[str, NDArray[Any]]:
+def _lay_out_columns(splats: PlyRows, layout: PlyLayout) -> dict[str, NDArray[Any]]:
+    """Return the columns of a PLY by name, [N] each, in the layout's order, types and names."""
     count = len(splats.means)
     means = splats.means.astype(f"<{layout.means_dtype or layout.dtype}")
     named: dict[str, NDArray[Any]] = {}

@@ -59,7 +59,7 @@ def check_renders(
 
 
 def _score_levels(source: SplatModel, data: bytes, header: SceneHeader, render_score: RenderScore) -> dict[str, float]:
-    """Return the PSNR of each level of detail above 0."""
+    """Return the PSNR of each level of detail above 0, dB, by its number as text."""
     nodes = read_nodes(memoryview(data), header)
     levels = sorted({node.level for node in nodes if node.level})
     cuts = {level: [tile.index for tile in select_tiles(header, nodes, level=level)] for level in levels}
@@ -69,7 +69,10 @@ def _score_levels(source: SplatModel, data: bytes, header: SceneHeader, render_s
 def _score_exact_attributes(
     source: SplatModel, decoded: SplatModel, pairs: SplatPairs, render_score: RenderScore
 ) -> dict[str, float]:
-    """Return the PSNR with exact values of one attribute at a time; the largest gain shows the worst attribute."""
+    """Return the PSNR, dB, with exact values of one attribute at a time: the largest gain shows the worst attribute.
+
+    Empty unless every splat has a source splat.
+    """
     if pairs.strays or pairs.surplus:
         return {}
     theirs = source.select(pairs.source_index)
@@ -97,14 +100,14 @@ def format_figures(figures: dict[str, dict[str, Any]]) -> str:
     for encoder, numbers in figures.items():
         psnr = f"{numbers['psnr']:.2f}" if numbers.get("psnr") is not None else ""
         size = f"in {numbers['bytes']:,}" if numbers.get("bytes") is not None else ""
-        words += [" ".join(part for part in (_DISPLAY_NAMES.get(encoder, encoder), psnr, size) if part)] * bool(
-            psnr or size
-        )
+        if psnr or size:
+            words.append(" ".join(part for part in (_DISPLAY_NAMES.get(encoder, encoder), psnr, size) if part))
     return f" ({', '.join(words)})" if words else ""
 
 
 @cache
 def _all_figures() -> dict[str, dict[str, dict[str, Any]]]:
+    """Read the figures of other encoders, by input and encoder; none if the package lacks the file."""
     if not _FIGURES.exists():
         return {}
     result: dict[str, dict[str, dict[str, Any]]] = json.loads(_FIGURES.read_text("utf-8"))

@@ -18,7 +18,8 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 #: Directions and colours of the lights.
 _LIGHTS = np.array(((0.8, -0.3, 0.5), (-0.7, 0.2, -0.6), (0.2, -0.3, -0.9), (-0.5, 0.3, 0.8)))
 _LIGHT_COLOURS = np.array(((1.0, 0.9, 0.7), (0.2, 0.5, 1.0), (0.9, 0.3, 0.2), (0.3, 0.9, 0.4)))
-_FACETS = 150
+_FACETS = 150  # of the ball of directions to which normals are rounded
+_OPPOSITE_MAX = 1e-9  # 1 + z of a normal that counts as opposite to z
 _LOBE = (1.0, 0.8, 0.6)  # weight of a highlight by band
 
 
@@ -54,7 +55,8 @@ def surface_scene(gloss: float, noise: float, seed: int) -> PlyRows:
 
 
 def _torus(columns: int, rows: int) -> Surface:
-    big, small = 1.0, 0.35
+    """Return a torus about y: `columns` rings of `rows` centres, with every other ring shifted by half a row."""
+    big, small = 1.0, 0.35  # radii, scene units
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
     around = 2.0 * np.pi * column / columns
     tube = 2.0 * np.pi * (row + 0.5 * (column % 2)) / rows
@@ -65,7 +67,8 @@ def _torus(columns: int, rows: int) -> Surface:
 
 
 def _ball(count: int) -> Surface:
-    radius = 0.55
+    """Return a ball of `count` centres on a Fibonacci spiral about y."""
+    radius = 0.55  # scene units
     height = 1.0 - (2.0 * np.arange(count) + 1.0) / count  # equal areas
     around = _GOLDEN_ANGLE * np.arange(count)
     across = np.sqrt(1.0 - height**2)
@@ -74,8 +77,8 @@ def _ball(count: int) -> Surface:
 
 
 def _box(side: int) -> list[Surface]:
-    """Return the faces of a flat box below the torus and the ball."""
-    half = np.array((1.5, 0.12, 1.5))
+    """Return the faces of a flat box below the torus and the ball, with `side` centres along x and z and 2 along y."""
+    half = np.array((1.5, 0.12, 1.5))  # half the edges, scene units
     spacing = 2.0 * half[0] / side
     positions = [(np.arange(count) + 0.5) / count * 2.0 - 1.0 for count in (side, 2, side)]
     faces = []
@@ -92,7 +95,7 @@ def _facing(normals: F64, rng: np.random.Generator) -> F64:
     """Return quats [N, 4] that map z to normals [N, 3], with a random rotation about the normal, sign and length."""
     # The vector half-way between z and the normal gives half the rotation; the opposite of z is reached about x.
     half = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
-    half[half[:, 0] < 1e-9] = (0.0, 1.0, 0.0, 0.0)
+    half[half[:, 0] < _OPPOSITE_MAX] = (0.0, 1.0, 0.0, 0.0)
     twist = rng.uniform(0.0, np.pi, len(normals))
     cos, sin, (w, x, y, z) = np.cos(twist), np.sin(twist), half.T
     quats = np.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], axis=1)
@@ -103,7 +106,7 @@ def _facing(normals: F64, rng: np.random.Generator) -> F64:
 def _permute_axes(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
     """Return quats [N, 4] and scales [N, 3] of the same splats, with axes in a random order, as in trained scenes."""
     quats, scales = quats.copy(), scales.copy()
-    for first in (0, 1, 0):
+    for first in (0, 1, 0):  # exchanges of neighbouring axes that give all six orders
         rows = rng.random(len(quats)) < 0.5
         w, x, y, z = quats[rows].T
         # A half turn about the bisector of two axes exchanges them.
@@ -138,7 +141,10 @@ def _highlights(normals: F64) -> F64:
 
 
 def _harmonics(directions: F64) -> F64:
-    """Return the basis functions 1 to 15, [N, 15], in the convention of splat renderers."""
+    """Return the real spherical harmonics of bands 1 to 3, [N, 15], in the order and signs of splat renderers.
+
+    `directions` are unit vectors, [N, 3].
+    """
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     c1, c2, c3 = np.sqrt(np.array((3.0, 15.0, 35.0)) / (4.0 * np.pi))

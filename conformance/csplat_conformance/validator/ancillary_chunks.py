@@ -93,10 +93,12 @@ class _Scanner:
         self.at = 0
 
     def error(self, what: str) -> JsonError:
+        """Return an error with the position and the next characters."""
         near = ascii(self.text[self.at : self.at + _SHOWN_MAX])
         return JsonError(f"{what} at character {self.at}, {near}")
 
     def skip(self) -> None:
+        """Step over white space."""
         match = _WHITESPACE.match(self.text, self.at)
         self.at = match.end() if match else self.at
 
@@ -183,14 +185,16 @@ class _Scanner:
 
 
 def _unescape(match: re.Match[str]) -> str:
+    """Return the UTF-16 unit of an escape, `u00e9` or `n`; `_STRING` admits no others."""
     code = match[1]
-    return chr(int(code[1:], 16)) if len(code) == 5 else _SHORT_ESCAPES[code]
+    return _SHORT_ESCAPES[code] if code in _SHORT_ESCAPES else chr(int(code[1:], 16))
 
 
 # Declared error bounds -----------------------------------------------------------------------------
 
+#: Components of a splat by measure: its rms is at most its maximum times their root (SER-2).
 _COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21, "sh4": 27}
-_ROUNDING = 1.0 + 2.0**-20  # SER-2
+_ROUNDING = 1.0 + 2.0**-20  # factor by which rounded bounds may exceed a limit (SER-2)
 
 
 def check_declared_bounds(payload: Payload, index: Index) -> None:
@@ -221,7 +225,7 @@ def check_declared_bounds(payload: Payload, index: Index) -> None:
 
 
 def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.DeclaredErrorRecord]) -> bool:
-    """Check SER-2; return True if maximum and rms can be compared."""
+    """Check SER-2; return True if it holds."""
     largest, rms = record.record.max, record.record.rms
     wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
     for key in wrong:

@@ -27,9 +27,11 @@ _SIZES_MIN = {
     "layer": _spec.LAYER_RECORD_SIZE,
 }
 _CODEBOOK_ID_SIZE = 2  # bytes
-_STEP_MIN = Fraction(1, 2**1022)
-_SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
+_STEP_MIN = Fraction(1, 2**1022)  # the smallest normal binary64
+_BINARY32_MIN, _BINARY32_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)  # normal values
+_BINARY32_BITS = 24  # of a significand
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
+#: Axis of each direction (right, left, up, down, front, back): an orientation names each axis once.
 _AXIS_OF_DIRECTION = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
 
 Head = PlacedRecord[_spec.IndexHead]
@@ -45,7 +47,7 @@ class Index:
         head: the index head.
         degree: `sh_degree`; `None` if it is beyond SH_DEGREE_MAX.
         attributes: attribute records by registry value.
-        steps: steps that obey ATT-6, by registry value.
+        steps: steps that obey ATT-6 and ATT-10, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
         codebooks: codebook records with valid kind and sizes, by id.
         codebook_ids: ids of all codebook records.
@@ -75,7 +77,7 @@ def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | 
     if abs(exponent) > 4096:  # beyond binary64 for every step; avoids huge integers
         return None
     product = Fraction(step) * Fraction(2) ** exponent
-    low, high = (_SINGLE_MIN, _SINGLE_MAX) if single else (_STEP_MIN, _STEP_MAX)
+    low, high = (_BINARY32_MIN, _BINARY32_MAX) if single else (_STEP_MIN, _STEP_MAX)
     return float(product) if low <= product <= high else None
 
 
@@ -114,8 +116,11 @@ def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
     return index
 
 
-def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
-    """Return the number of records of a kind that fit into the index; none after a kind that did not fit."""
+def _count_fitting_records(index: Index, at: int, end: int, count: int, size: int) -> int:
+    """Return how many of `count` records of `size` bytes fit between `at` and `end`.
+
+    Sets `index.complete` to False if not all fit, and returns 0 if it already is False.
+    """
     fitting = min(count, max(0, (end - at) // size)) if index.complete else 0
     index.complete &= fitting == count
     return fitting
@@ -150,14 +155,17 @@ def _check_head(log: ViolationLog, head: Head) -> None:
 
 
 def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
-    """Read the attribute records from `at` on, check RES-1 and ATT-1 to ATT-10, and return the end offset."""
+    """Read the attribute records from `at` on, check RES-1 and ATT-1 to ATT-10, and return the end offset.
+
+    Adds the first record of each known attribute to `index.attributes`, and its valid step or levels to the index.
+    """
     count = index.head.record.attribute_count
     bands = 0 if index.degree is None else index.degree
     expected = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(expected):
         message = f"{count}, expected {len(expected)} for SH degree {bands}"
         log.add_field("ATT-1", index.head, "attribute_count", message)
-    for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
+    for i in range(_count_fitting_records(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = read_record(view, _spec.AttributeRecord, at, name)
@@ -211,27 +219,30 @@ def _check_lattice(log: ViolationLog, placed: AttributeAt, index: Index) -> None
         log.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, expected 0")
     if not 2.0**-1022 <= record.step < math.inf:
         log.add_field("ATT-6", placed, "step", f"{record.step}, expected positive, finite and at least 2^-1022")
-    elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(Fraction(record.step)):
+    elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_normal_binary32(Fraction(record.step)):
         log.add_field("ATT-10", placed, "step", f"{record.step}, expected a binary32 value of at least 2^-126")
     else:
         index.steps[record.attribute] = record.step
 
 
-def _is_single(step: Fraction) -> bool:
+def _is_normal_binary32(step: Fraction) -> bool:
     """Return True for a normal binary32 value: at most 24 bits from the first 1 to the last."""
-    if not _SINGLE_MIN <= step <= _SINGLE_MAX:
+    if not _BINARY32_MIN <= step <= _BINARY32_MAX:
         return False
-    odd = step.numerator  # the denominator is a power of two
-    return (odd // (odd & -odd)).bit_length() <= 24
+    numerator = step.numerator  # the denominator is a power of two
+    return (numerator // (numerator & -numerator)).bit_length() <= _BINARY32_BITS
 
 
 # Codebook records ----------------------------------------------------------------------------------
 
 
 def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
-    """Read the codebook records from `at` on, check RES-1 and CBR-1 to CBR-4, and return the end offset."""
+    """Read the codebook records from `at` on, check RES-1 and CBR-1 to CBR-4, and return the end offset.
+
+    Adds the valid ones to `index.codebooks`, and the ids of all to `index.codebook_ids`.
+    """
     last = -1
-    for _ in range(_count_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
+    for _ in range(_count_fitting_records(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
         identity = int.from_bytes(view[at : at + _CODEBOOK_ID_SIZE], "little")
         name = f"codebook[{identity}]"
         placed = read_record(view, _spec.CodebookRecord, at, name)
@@ -247,9 +258,9 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: Viol
 
 
 def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> bool:
-    """Check RES-2, CBR-2 and CBR-4; return True if they hold."""
+    """Check RES-2 of the kind, CBR-2 and CBR-4; return True if they hold."""
     record = placed.record
-    before = len(log.violations)
+    violation_count = len(log.violations)
     first, last = record.band_first, record.band_last
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
         log.add_field("RES-2", placed, "kind", f"{record.kind} is not a kind of this version")
@@ -261,16 +272,19 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
         log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} for a kind without bands, expected 0")
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
         log.add_field("CBR-4", placed, "size", f"{record.size} entries, expected 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
-    return len(log.violations) == before
+    return len(log.violations) == violation_count
 
 
 # Extra column records ------------------------------------------------------------------------------
 
 
 def _read_extras(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
-    """Read the extra column records from `at` on, check RES-2 and EXR-1 to EXR-3, and return the end offset."""
+    """Read the extra column records from `at` on, check RES-2 and EXR-1 to EXR-3, and return the end offset.
+
+    Adds the bytes per value of each column to `index.extras`, `None` for unknown types.
+    """
     names: set[str] = set()
-    for i in range(_count_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
+    for i in range(_count_fitting_records(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
         placed = read_record(view, _spec.ExtraRecord, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
@@ -285,10 +299,9 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, log: Violati
 
 
 def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
-    """Check EXR-2 and EXR-3, and add the name to the `names` of the columns before."""
-    raw = placed.record.name[: placed.record.name_size]
-    rest = placed.record.name[placed.record.name_size :]
-    if any(rest):
+    """Check EXR-2 and EXR-3, and add the name to `names`, those of the preceding columns."""
+    raw, padding = placed.record.name[: placed.record.name_size], placed.record.name[placed.record.name_size :]
+    if any(padding):
         log.add_field("EXR-3", placed, "name", "bytes after the name are not 0", within=len(raw))
     try:
         name = raw.decode("utf-8")
@@ -392,7 +405,10 @@ def read_directory(view: memoryview, at: int, end: int, index: Index, log: Viola
 
 
 def _chunk_name(record: _spec.DirectoryRecord, known: list[str]) -> str:
-    """Return the name of a chunk, with escapes for bytes that are not printable."""
+    """Return the name of a chunk, `META`, `META#1` or `CODB.2.0`, with escapes for bytes that are not printable.
+
+    `known` are the names of the preceding chunks.
+    """
     kind = ascii(record.type.decode("latin-1"))[1:-1]
     if record.type == _spec.CHUNK_CODEBOOK:
         kind = f"CODB.{record.id}.{record.layer}"
@@ -406,7 +422,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
     if kind == _spec.CHUNK_TILE:
         log.add_field("DIR-1", placed, "type", "TILE, which only layer records list")
         return
-    if not all(0x20 <= byte <= 0x7E for byte in kind):
+    if not all(0x20 <= byte <= 0x7E for byte in kind):  # printable ASCII
         log.add_field("DIR-1", placed, "type", f"{kind!r}, expected bytes 0x20 to 0x7E")
     flags = record.flags & _REGISTERED_FLAGS
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
@@ -423,16 +439,16 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
 
 def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
     """Check DIR-4: there is at most one chunk of certain types, with id and layer 0."""
-    seen = set()
+    seen_kinds: set[bytes] = set()
     for chunk in chunks:
         if chunk.kind not in _SINGLE_CHUNKS:
             continue
-        if chunk.kind in seen:
+        if chunk.kind in seen_kinds:
             log.add_field("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
         if chunk.identity or chunk.layer:
             where = f"id {chunk.identity} and layer {chunk.layer}"
             log.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, expected 0 and 0")
-        seen.add(chunk.kind)
+        seen_kinds.add(chunk.kind)
 
 
 def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: Index, start: int) -> None:
@@ -602,14 +618,15 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, log: Violat
 
 
 def _check_level(log: ViolationLog, tile: Tile, lowest: int) -> None:
-    """Check TIL-12, given the level of the tile before."""
+    """Check TIL-12: the tile's level is at least `lowest`, the level of the preceding tile, or 0 for the first tile."""
     if tile.level < lowest:
         log.add_field("TIL-12", tile.record, "level", f"{tile.level} after {lowest}, expected ascending levels")
 
 
 def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
-    """Check TIL-7 to TIL-9, and MEA-1 if they hold."""
-    record, before = tile.record.record, len(log.violations)
+    """Check TIL-7 and TIL-8, TIL-9 if the step is valid, and MEA-1 if all of them hold."""
+    record = tile.record.record
+    violation_count = len(log.violations)
     for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
         if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
             message = f"axis {axis} is {corner} to {corner + extent}, expected at most {_spec.INTEGER_MAX} in magnitude"
@@ -624,7 +641,7 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
     if scale is None:
         message = f"{step} x 2^{record.exponent} is not finite and at least 2^-1022"
         log.add_field("TIL-9", tile.record, "exponent", message)
-    elif len(log.violations) == before:
+    elif len(log.violations) == violation_count:
         for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
             if not (is_finite(corner, scale) and is_finite(corner + extent, scale)):
                 message = f"axis {axis} is ({corner} to {corner + extent}) x {scale}, expected numbers of binary32"
@@ -632,8 +649,12 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
 
 
 def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
-    """Read the layer records of a tile from `at` on; check RES-1, RES-2, TIL-2, TIL-3, TIL-5 and CHK-3."""
-    start, last = at, -1
+    """Read the layer records of a tile from `at` on; check RES-1, RES-2, TIL-2, TIL-3, TIL-5 and CHK-3.
+
+    Adds a chunk for each record to `tile.chunks`.
+    """
+    start = at
+    last = -1  # highest layer so far
     flags = registered_flags(_spec.CHUNK_TILE)
     for i in range(tile.record.record.layer_count):
         layer = view[at]
@@ -663,7 +684,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
 
 
 def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
-    """Read the codebook ids of a tile from `at` on, and check TIL-6."""
+    """Read the codebook ids of a tile from `at` on, check TIL-6, and add all ids to `tile.codebook_ids`."""
     last = -1
     for k in range(tile.record.record.table_count):
         identity = int.from_bytes(view[at : at + _CODEBOOK_ID_SIZE], "little")

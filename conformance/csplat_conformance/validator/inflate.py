@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+# Block types, symbols and limits of RFC 1951, 3.2.3 to 3.2.7.
 _STORED, _FIXED, _DYNAMIC = 0, 1, 2
-_END_OF_BLOCK = 256
-_LITERALS_MAX, _DISTANCES_MAX = 286, 30
-_BITS_MAX = 15
-_ORDER = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
-_LONGEST_SYMBOL, _LONGEST = 285, 258
+_END_OF_BLOCK = 256  # symbol; smaller ones are literals
+_FIRST_LENGTH, _LENGTH_MIN = 257, 3  # smallest symbol of a match, and the length that it stands for
+_LITERALS_MAX, _DISTANCES_MAX = 286, 30  # symbols of each code
+_CODEWORD_BITS_MAX = 15
+_COPY_PREVIOUS = 16  # smallest symbol that repeats code lengths; it repeats the previous one, 17 and 18 repeat 0
+_REPEATS = ((3, 2), (3, 3), (11, 7))  # smallest number of repetitions and its extra bits, for symbols 16 to 18
+_LENGTHS_ORDER = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
+_LONGEST_MATCH_SYMBOL, _LONGEST_MATCH = 285, 258  # the only length symbol outside the regular series
 _FIXED_LENGTHS = [8] * 144 + [9] * 112 + [7] * 24 + [8] * 8
 _FIXED_DISTANCES = [5] * 32
 
@@ -38,7 +42,7 @@ class Inflater:
 
     def __init__(self, coded: bytes) -> None:
         self._coded = coded
-        self._at = 0  # bits
+        self._bit_offset = 0
         self._out = bytearray()
 
     def inflate(self, size: int) -> bytes:
@@ -49,13 +53,13 @@ class Inflater:
         """
         final = 0
         while not final:
-            final, kind = self._number(1), self._number(2)
+            final, kind = self._read_bits(1), self._read_bits(2)
             if kind == _STORED:
                 self._read_stored()
             elif kind == _FIXED:
-                self._matches(_Code(_FIXED_LENGTHS), _Code(_FIXED_DISTANCES), size)
+                self._read_body(_Code(_FIXED_LENGTHS), _Code(_FIXED_DISTANCES), size)
             elif kind == _DYNAMIC:
-                self._matches(*self._codes(), size)
+                self._read_body(*self._read_codes(), size)
             else:
                 raise CodedError("COD-2", "a block of type 3")
             if len(self._out) > size:
@@ -65,112 +69,133 @@ class Inflater:
     @property
     def used(self) -> int:
         """Number of bytes that were read at least in part."""
-        return (self._at + 7) // 8
+        return (self._bit_offset + 7) // 8
 
     def refuse(self, clause: str, message: str) -> None:
-        """Raise the error of a clause from COD-5 on."""
+        """Raise the error of a clause from COD-5 on. A subclass may return instead, so callers can go on."""
         raise CodedError(clause, message)
 
-    def _number(self, count: int) -> int:
-        """Read an integer of `count` bits, the lowest first."""
-        at, end = self._at, self._at + count
+    def _read_bits(self, count: int) -> int:
+        """Read an integer of `count` bits, the lowest first.
+
+        Raises:
+            CodedError: COD-2 if fewer bits are left.
+        """
+        at, end = self._bit_offset, self._bit_offset + count
         if end > 8 * len(self._coded):
             raise CodedError("COD-2", "the DEFLATE stream has no end")
-        self._at = end
+        self._bit_offset = end
         piece = int.from_bytes(self._coded[at >> 3 : (end + 7) >> 3], "little")
         return piece >> (at & 7) & (1 << count) - 1
 
     def _read_stored(self) -> None:
-        """Read a stored block, which begins at the next whole byte."""
-        self._at = 8 * self.used
-        size, complement = self._number(16), self._number(16)
+        """Append a stored block, which begins at the next whole byte, to the output; COD-2 if it is invalid."""
+        self._bit_offset = 8 * self.used
+        size, complement = self._read_bits(16), self._read_bits(16)
         if size ^ complement != 0xFFFF:
             raise CodedError("COD-2", "the length of a stored block and its complement differ")
-        start = self._at // 8
+        start = self._bit_offset // 8
         if start + size > len(self._coded):
             raise CodedError("COD-2", "the DEFLATE stream has no end")
         self._out += self._coded[start : start + size]
-        self._at += 8 * size
+        self._bit_offset += 8 * size
 
-    def _codes(self) -> tuple[_Code, _Code]:
-        """Read the header of a dynamic block."""
-        literals, distances = self._number(5) + 257, self._number(5) + 1
-        if literals > _LITERALS_MAX or distances > _DISTANCES_MAX:
-            self.refuse(
-                "COD-5", f"{literals} literal/length and {distances} distance codes, expected at most 286 and 30"
-            )
-        lengths = [0] * len(_ORDER)
-        for symbol in _ORDER[: self._number(4) + 4]:
-            lengths[symbol] = self._number(3)
+    def _read_codes(self) -> tuple[_Code, _Code]:
+        """Read the header of a dynamic block (RFC 1951, 3.2.7); return its literal/length and its distance code.
+
+        Checks COD-5 to COD-7.
+        """
+        # The header stores each count less its minimum: HLIT, HDIST, and HCLEN below.
+        literal_count, distance_count = self._read_bits(5) + 257, self._read_bits(5) + 1
+        if literal_count > _LITERALS_MAX or distance_count > _DISTANCES_MAX:
+            counts = f"{literal_count} literal/length and {distance_count} distance codes"
+            self.refuse("COD-5", f"{counts}, expected at most {_LITERALS_MAX} and {_DISTANCES_MAX}")
+        lengths = [0] * len(_LENGTHS_ORDER)
+        for symbol in _LENGTHS_ORDER[: self._read_bits(4) + 4]:
+            lengths[symbol] = self._read_bits(3)
         if not _is_complete(lengths):
             self.refuse("COD-6", "the code of the code lengths is not complete")
-        lengths = self._lengths(_Code(lengths), literals + distances)
+        lengths = self._read_lengths(_Code(lengths), literal_count + distance_count)
         if not lengths[_END_OF_BLOCK]:
             self.refuse("COD-7", "symbol 256 has no codeword")
-        of_literals, of_distances = lengths[:literals], lengths[literals:]
-        if not _is_complete(of_literals) and not _is_lone(of_literals):
+        of_literals, of_distances = lengths[:literal_count], lengths[literal_count:]
+        if not _is_complete(of_literals) and not _is_one_bit_code(of_literals):
             self.refuse("COD-6", "the literal/length code is not complete")
-        if any(of_distances) and not _is_complete(of_distances) and not _is_lone(of_distances):
+        if any(of_distances) and not _is_complete(of_distances) and not _is_one_bit_code(of_distances):
             self.refuse("COD-6", "the distance code is not complete")
         return _Code(of_literals), _Code(of_distances)
 
-    def _lengths(self, code: _Code, count: int) -> list[int]:
-        """Read `count` code lengths, which `code` compresses."""
+    def _read_lengths(self, code: _Code, count: int) -> list[int]:
+        """Read `count` code lengths, which `code` compresses, and check COD-7."""
         lengths: list[int] = []
         while len(lengths) < count:
-            symbol = self._symbol(code)
-            if symbol <= _BITS_MAX:
+            symbol = self._read_symbol(code)
+            if symbol <= _CODEWORD_BITS_MAX:
                 lengths.append(symbol)
                 continue
-            if symbol == 16 and not lengths:
+            if symbol == _COPY_PREVIOUS and not lengths:
                 self.refuse("COD-7", "the first code length repeats a previous one")
-            value = lengths[-1] if symbol == 16 and lengths else 0
-            repeat = (3, 3, 11)[symbol - 16] + self._number((2, 3, 7)[symbol - 16])
+            value = lengths[-1] if symbol == _COPY_PREVIOUS and lengths else 0
+            least, extra_bits = _REPEATS[symbol - _COPY_PREVIOUS]
+            repeat = least + self._read_bits(extra_bits)
             if len(lengths) + repeat > count:
                 self.refuse("COD-7", f"code lengths repeat beyond the last of {count}")
             lengths += [value] * repeat
         return lengths[:count]
 
-    def _matches(self, literals: _Code, distances: _Code, size: int) -> None:
-        """Read the body of a block to its end, or until there are more than `size` bytes."""
+    def _read_body(self, literals: _Code, distances: _Code, size: int) -> None:
+        """Append the literals and matches of a block to the output, and check COD-8.
+
+        Returns after the end of the block, or once the output has more than `size` bytes.
+        """
         out = self._out
         while len(out) <= size:
-            symbol = self._symbol(literals)
+            symbol = self._read_symbol(literals)
             if symbol < _END_OF_BLOCK:
                 out.append(symbol)
                 continue
             if symbol == _END_OF_BLOCK:
                 return
-            if symbol > _LONGEST_SYMBOL:
+            if symbol > _LONGEST_MATCH_SYMBOL:
                 self.refuse("COD-8", f"literal/length symbol {symbol}")
-            length = 3 + self._value(symbol - 257, 4) if symbol < _LONGEST_SYMBOL else _LONGEST
-            symbol = self._symbol(distances)
+            length = (
+                _LENGTH_MIN + self._read_value(symbol - _FIRST_LENGTH, 4)
+                if symbol < _LONGEST_MATCH_SYMBOL
+                else _LONGEST_MATCH
+            )
+            symbol = self._read_symbol(distances)
             if symbol >= _DISTANCES_MAX:
                 self.refuse("COD-8", f"distance symbol {symbol}")
-            distance = 1 + self._value(min(symbol, _DISTANCES_MAX - 1), 2)
+            distance = 1 + self._read_value(min(symbol, _DISTANCES_MAX - 1), 2)
             if distance > len(out):
                 self.refuse("COD-8", f"distance {distance} after {len(out)} bytes")
-            pattern = out[-distance:].rjust(distance, b"\0")
+            pattern = out[-distance:].rjust(distance, b"\0")  # zeros before the output, if COD-8 is ignored
             out += (pattern * (length // distance + 1))[:length]
 
-    def _value(self, symbol: int, group: int) -> int:
-        """Return length - 3 (`group` is 4 symbols per number of extra bits) or distance - 1 (`group` is 2)."""
+    def _read_value(self, symbol: int, group: int) -> int:
+        """Read the extra bits of a symbol and return length - 3 or distance - 1 (RFC 1951, 3.2.5).
+
+        Args:
+            symbol: symbol, counted from the first length or the first distance.
+            group: symbols for each number of extra bits: 4 for lengths, 2 for distances.
+        """
         extra = max(0, symbol // group - 1)
         first = symbol if symbol < group else (group + symbol % group) << extra
-        return first + self._number(extra)
+        return first + self._read_bits(extra)
 
-    def _symbol(self, code: _Code) -> int:
-        """Read a codeword (RFC 1951, 3.2.2)."""
-        word = first = index = 0
+    def _read_symbol(self, code: _Code) -> int:
+        """Read a codeword and return its symbol (RFC 1951, 3.2.2); COD-8 if there is none."""
+        word = first = 0  # the bits so far, and the first codeword of that length
+        index = 0  # of the first symbol with a codeword of that length
         for count in code.counts:
-            word |= self._number(1)
+            word |= self._read_bits(1)
             if word - first < count:
                 return code.symbols[index + word - first]
             index += count
             first = first + count << 1
             word <<= 1
         self.refuse("COD-8", "a codeword without a symbol")
-        return code.symbols[0] if code.symbols else 0
+        return code.symbols[0] if code.symbols else 0  # only if COD-8 is ignored
 
 
 class _Code:
@@ -183,9 +208,10 @@ class _Code:
 
 
 def _is_complete(lengths: Sequence[int]) -> bool:
-    return sum(1 << _BITS_MAX - length for length in lengths if length) == 1 << _BITS_MAX
+    """Return True if the codewords fill the code exactly: their Kraft sum is 1. False for a code without codewords."""
+    return sum(1 << _CODEWORD_BITS_MAX - length for length in lengths if length) == 1 << _CODEWORD_BITS_MAX
 
 
-def _is_lone(lengths: Sequence[int]) -> bool:
-    """Return True if the only codeword has one bit."""
+def _is_one_bit_code(lengths: Sequence[int]) -> bool:
+    """Return True if there is a single codeword, of one bit."""
     return [length for length in lengths if length] == [1]

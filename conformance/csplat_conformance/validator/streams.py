@@ -85,14 +85,15 @@ def read_stream(
         return Stream(head, None)
     if spare_bits:
         log.remarks.append(f"{payload.name}/{what}.coded: the unused bits after the final block are not 0 (6.2)")
-    return Stream(head, _elements(log, head, packed, at, signed) if sound else None)
+    return Stream(head, _undo_transforms(log, head, packed, at, signed) if sound else None)
 
 
 def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
-    """Check STR-1 and STR-2."""
+    """Check STR-1 and STR-2; return True if they hold. A `count` of `None` permits any number of elements from 1 on."""
     sound = True
     announced, width = head.record.count, head.record.width
-    if announced != (max(1, announced) if count is None else count):
+    count_valid = announced >= 1 if count is None else announced == count
+    if not count_valid:
         log.add_field("STR-1", head, "count", f"{announced}, expected {'1 or more' if count is None else count}")
         sound = False
     if not 1 <= width <= width_max:
@@ -102,7 +103,7 @@ def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count
 
 
 def _check_transforms(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> bool:
-    """Check RES-2 and STR-3."""
+    """Check RES-2 of the transforms, and STR-3; return True if they hold."""
     listed = head.record.transforms
     used = listed.rstrip(b"\0")
     unknown = [value for value in used if value not in _spec.TRANSFORM_NAMES]
@@ -116,7 +117,7 @@ def _check_transforms(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -
 
 
 def _check_packed(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], sound: bool) -> bool:
-    """Check STR-4 and STR-5, if count, width and transforms are known."""
+    """Check STR-4 or STR-5; return True if it holds, False unless `sound`: count, width and transforms are valid."""
     if not sound:
         return False
     size, packed = head.record.count * head.record.width, head.record.packed_size
@@ -131,7 +132,7 @@ def _check_packed(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], sound
 
 
 def _check_coder(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> bool:
-    """Check RES-2."""
+    """Check RES-2 of the coder; return True if it is known."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
         log.add_field("RES-2", head, "coder", f"{coder} is not a coder of this version")
@@ -142,7 +143,7 @@ def _check_coder(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> boo
 # Transforms, undone last to first ------------------------------------------------------------------
 
 
-def _elements(
+def _undo_transforms(
     log: ViolationLog, head: PlacedRecord[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
 ) -> Elements | None:
     """Undo the transforms of a stream, and check TRF-1.
@@ -152,7 +153,7 @@ def _elements(
         head: the stream head.
         packed: `packed_size` bytes.
         coded_at: offset of the coded bytes.
-        signed: elements are signed integers.
+        signed: elements are in two's complement.
 
     Returns:
         [count]; `None` if TRF-1 does not hold.
@@ -160,7 +161,7 @@ def _elements(
     record = head.record
     data = np.frombuffer(packed, np.uint8)
     if _spec.TRANSFORM_RUN_LENGTH in record.transforms:
-        runs = data.reshape(3, -1)
+        runs = data.reshape(3, -1)  # values, then low and high bytes of the lengths - 1
         lengths = runs[1].astype(np.int64) + 256 * runs[2].astype(np.int64) + 1
         total = int(lengths.sum())
         expected = record.count * record.width
@@ -171,7 +172,9 @@ def _elements(
     width, count = record.width, record.count
     if width == 1 and not signed and not {_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG} & set(record.transforms):
         return data  # nothing to undo for texts and plain bytes
-    planes = data.reshape(width, count) if _spec.TRANSFORM_BYTE_PLANES in record.transforms else _columns(data, width)
+    planes = (
+        data.reshape(width, count) if _spec.TRANSFORM_BYTE_PLANES in record.transforms else _split_bytes(data, width)
+    )
     values = np.zeros(count, np.uint64)
     for i in range(width):
         values |= planes[i].astype(np.uint64) << np.uint64(8 * i)
@@ -187,11 +190,12 @@ def _elements(
     return values if width == 8 else values.view(np.int64)
 
 
-def _columns(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+def _split_bytes(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """Return byte i of each element as row i, [width, n]."""
     return data.reshape(-1, width).T
 
 
-_RAW_DEFLATE = -15
+_RAW_DEFLATE = -15  # `wbits` of zlib: no header, a window of 2^15 bytes
 
 
 def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
@@ -216,42 +220,51 @@ def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
 
 
 def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
-    """Inflate and check COD-2 and COD-5 to COD-8. The last byte is inflated separately to find its unused bits."""
+    """Inflate `size` bytes, and check COD-2 and COD-5 to COD-8.
+
+    Returns:
+        The bytes, and whether unused bits after the stream are set, for which the last byte is inflated separately.
+
+    Raises:
+        CodedError: a clause is violated.
+    """
     body, last = coded[:-1], bytes(coded[-1:])
     inflater = zlib.decompressobj(_RAW_DEFLATE)
     try:
         packed = inflater.decompress(body, size + 1)
         if inflater.eof:
-            left = len(inflater.unused_data) + len(last)
-            raise CodedError("COD-2", f"{left} bytes follow the final block", len(coded) - left)
+            unused_size = len(inflater.unused_data) + len(last)
+            raise CodedError("COD-2", f"{unused_size} bytes follow the final block", len(coded) - unused_size)
         if len(packed) > size:
             raise CodedError("COD-2", f"more than {size} bytes were inflated, expected packed_size, {size}")
-        before = inflater.copy()
-        rest = inflater.decompress(last, size + 1 - len(packed))
+        body_state = inflater.copy()
+        tail = inflater.decompress(last, size + 1 - len(packed))
     except zlib.error as error:
         Inflater(bytes(coded)).inflate(size)  # raises with the clause
         raise CodedError("COD-2", f"not a DEFLATE stream: {error}") from None
-    packed += rest
+    packed += tail
     if len(packed) != size:
         amount = f"more than {size}" if len(packed) > size else len(packed)
         raise CodedError("COD-2", f"{amount} bytes were inflated, expected packed_size, {size}")
     if not inflater.eof:
         raise CodedError("COD-2", "the DEFLATE stream has no end")
-    return packed, _has_spare_bits(before, last[0], rest)
+    return packed, _has_spare_bits(body_state, last[0], tail)
 
 
-def _has_spare_bits(before: zlib._Decompress, last: int, rest: bytes) -> bool:
+def _has_spare_bits(body_state: zlib._Decompress, last_byte: int, tail: bytes) -> bool:
     """Return True if bits of the last byte are set after the end of the final block.
+
+    `body_state` is the inflater before the last byte, which gives the bytes `tail`.
 
     If the bits from k on are cleared, the stream ends in the same way once k reaches the end of the block. A smaller k
     has this effect only if the bits in between were already 0.
     """
     for k in range(8):
-        trial = before.copy()
+        trial = body_state.copy()
         try:
-            same = trial.decompress(bytes([last & (1 << k) - 1]), len(rest) + 1) == rest
+            same = trial.decompress(bytes([last_byte & (1 << k) - 1]), len(tail) + 1) == tail
         except zlib.error:
             continue
         if same and trial.eof:
-            return bool(last >> k)
+            return bool(last_byte >> k)
     return False

@@ -20,7 +20,8 @@ BlockHead = PlacedRecord[_spec.BlockHead]
 CodebookEntries = dict[tuple[int, int], I64]
 
 _SPARSE_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_SPARSE]
-_MORTON_AXES = 3
+_AXES = 3
+_OFFSET_SIZE = 4  # bytes
 
 
 @dataclass
@@ -87,6 +88,7 @@ class TileChecker:
             payload.finish()
 
     def _expected_blocks(self, layer: int) -> list[int]:
+        """Return the attribute of each block of a layer, in order (TLE-2)."""
         if layer == _spec.LAYER_EXTRA:
             return [_spec.ATTRIBUTE_EXTRA] * self.index.head.record.extra_count
         return [attribute for attribute, attribute_layer in _spec.ATTRIBUTE_LAYER.items() if attribute_layer == layer]
@@ -129,16 +131,21 @@ class TileChecker:
             self._read_plain(payload, name, attribute, coding)
 
     def _read_sparse(self, payload: Payload, name: str, attribute: int) -> None:
-        """Check SPA-1 to SPA-3 and the clauses of SIGNED."""
+        """Read and check a block coded SPARSE: SPA-1 to SPA-3, LAT-1, and the ranges of the integers.
+
+        Raises:
+            UnreadableError: SPA-1 does not hold, so the size of the second stream is unknown.
+        """
         params = payload.structure(_spec.SparseParams, f"{name}.params")
         exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
         sound = self.check_step(params, exponent, attribute)
         if not 1 <= announced <= count:
             self.log.add_field("SPA-1", params, "present_count", f"{announced}, expected 1 to {count}")
-        mask = read_stream(payload, f"{name}.mask", -(-count // 8), 1)
+        mask_size = (count + 7) // 8  # bytes
+        mask = read_stream(payload, f"{name}.mask", mask_size, 1)
         where = (mask.head.offset, f"{payload.name}/{name}.mask")
         if mask.elements is not None:
-            bits = int.from_bytes(bytes(mask.elements.astype(np.uint8)), "little")
+            bits = int.from_bytes(bytes(mask.elements.astype(np.uint8)), "little")  # bit i belongs to splat i
             if bits >> count:
                 self.log.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
             set_count = (bits & (1 << count) - 1).bit_count()
@@ -154,7 +161,7 @@ class TileChecker:
             check_integers(self.log, self.index, attribute, rows, exponent, where)
 
     def check_step(self, params: PlacedRecord[Any], exponent: int, attribute: int) -> bool:
-        """Check LAT-1; return True if it holds."""
+        """Check LAT-1; return True if it holds, or if the step of the attribute is invalid anyway (ATT-6, ATT-10)."""
         step = self.index.steps.get(attribute)
         if step is None or scaled_step(step, exponent, single=True) is not None:
             return True
@@ -164,6 +171,7 @@ class TileChecker:
         return False
 
     def _read_plain(self, payload: Payload, name: str, attribute: int, coding: int) -> None:
+        """Read and check a block coded LEVELS, OFFSET or SIGNED, and TIL-11 for scales."""
         rows, exponent = read_columns(self, payload, name, attribute, coding, self.tile.count)
         if rows is not None and attribute == _spec.ATTRIBUTE_SCALES:
             self.check_scales(int(rows.max()), exponent)
@@ -177,7 +185,7 @@ class TileChecker:
         check_max_scale(self.log, self.index, largest, exponent, stored, where)
 
     def _read_means(self, payload: Payload, name: str, coding: int) -> None:
-        """Check MOR-1, MOR-2, AXI-1 and TIL-10."""
+        """Read and check a block of means: MOR-1 and MOR-2, or AXI-1, and TIL-10 if they hold."""
         count, width_max = self.tile.count, _spec.CODING_WIDTH_MAX[coding]
         rows: I64 | None
         if coding == _spec.CODING_MORTON:
@@ -186,15 +194,15 @@ class TileChecker:
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
                 self.log.add_field("MOR-1", params, "bits", f"{bits}, expected 1 to {_spec.MORTON_BITS_MAX}")
             stream = read_stream(payload, f"{name}.stream", count, width_max)
-            rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
+            rows = None if stream.elements is None else _split_morton_codes(stream.elements.astype(np.int64))
             largest = 0 if stream.elements is None else int(stream.elements.max())
-            if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _MORTON_AXES * bits:
-                message = f"a code of {largest}, expected less than 2^{_MORTON_AXES * bits}"
+            if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _AXES * bits:
+                message = f"a code of {largest}, expected less than 2^{_AXES * bits}"
                 self.log.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         else:
-            stream = read_stream(payload, f"{name}.stream", _MORTON_AXES * count, width_max)
-            rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_MORTON_AXES, count)
+            stream = read_stream(payload, f"{name}.stream", _AXES * count, width_max)
+            rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_AXES, count)
             if rows is not None and int(rows.max()) >> _spec.AXIS_BITS_MAX:
                 message = f"an integer of {int(rows.max())}, expected less than 2^{_spec.AXIS_BITS_MAX}"
                 self.log.add("AXI-1", stream.head.offset, f"{payload.name}/{name}.stream", message)
@@ -204,7 +212,7 @@ class TileChecker:
             check_box(self.log, record.record, rows, (record.at("corner"), record.path("corner")))
 
     def _read_raw(self, payload: Payload, name: str, number: int) -> None:
-        """Check RAW-1 and RAW-2; `number` is the index of the column."""
+        """Read and check the block of an extra column: RAW-1, RAW-2; `number` is the index of the column."""
         params = payload.structure(_spec.RawParams, f"{name}.params")
         if params.record.column != number:
             self.log.add_field("RAW-1", params, "column", f"{params.record.column}, expected {number}")
@@ -225,6 +233,15 @@ def read_columns(
 ) -> tuple[I64 | None, int]:
     """Read and check a block coded LEVELS, OFFSET or SIGNED.
 
+    Args:
+        reader: the tile.
+        payload: reader after the block head.
+        name: name of the block.
+        attribute: registry value.
+        coding: registry value of one of the three codings.
+        count: number of splats with values.
+        escape: the block is the escape block of another, whose exponent is 0.
+
     Returns:
         [C, count] integers, `None` if a violation prevents decoding or they are out of range; and the exponent.
     """
@@ -234,16 +251,16 @@ def read_columns(
         fixed = escape or attribute == _spec.ATTRIBUTE_QUATS
         exponent, sound = read_exponent(reader, payload, f"{name}.params", attribute, fixed=fixed)
     if coding == _spec.CODING_OFFSET:
-        offsets, sane = read_offsets(payload, f"{name}.offsets", columns)
-        sound &= sane
+        offsets, offsets_valid = read_offsets(payload, f"{name}.offsets", columns)
+        sound &= offsets_valid
     width_max, signed = _spec.CODING_WIDTH_MAX[coding], coding == _spec.CODING_SIGNED
     stream = read_stream(payload, f"{name}.stream", columns * count, width_max, signed=signed)
     if stream.elements is None or not sound:
         return None, exponent
     rows = stream.elements.astype(np.int64).reshape(columns, count) + np.array(offsets, np.int64)[:, None]
     where = (stream.head.offset, f"{payload.name}/{name}.stream")
-    good = check_integers(reader.log, reader.index, attribute, rows, exponent, where)
-    return (rows if good else None), exponent
+    in_range = check_integers(reader.log, reader.index, attribute, rows, exponent, where)
+    return (rows if in_range else None), exponent
 
 
 def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
@@ -257,24 +274,27 @@ def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: i
 
 
 def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:
-    """Read the offsets. Return them, and True if LAT-3 holds."""
-    at = payload.take(4 * columns, name)
+    """Read an offset for each column. Return them, and True if LAT-3 holds."""
+    at = payload.take(_OFFSET_SIZE * columns, name)
     offsets = [int(value) for value in np.frombuffer(payload.view, "<i4", columns, at)]
     sound = True
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
             message = f"offset {i} is {offset}, expected at most {_spec.COLUMN_MAX} in magnitude"
-            payload.log.add("LAT-3", at + 4 * i, f"{payload.name}/{name}", message)
+            payload.log.add("LAT-3", at + _OFFSET_SIZE * i, f"{payload.name}/{name}", message)
             sound = False
     return offsets, sound
 
 
-def _axes(codes: I64) -> I64:
-    """Split codes [n] into axes [3, n]: bit 3·b + a of a code is bit b of axis a (6.4.2)."""
-    rows = np.zeros((_MORTON_AXES, len(codes)), np.int64)
-    for axis in range(_MORTON_AXES):
+def _split_morton_codes(codes: I64) -> I64:
+    """Split Morton codes, [n], into the integers of the axes, [3, n] (6.4.2).
+
+    Bit 3·b + a of a code is bit b of axis a.
+    """
+    rows = np.zeros((_AXES, len(codes)), np.int64)
+    for axis in range(_AXES):
         for bit in range(_spec.MORTON_BITS_MAX):
-            rows[axis] |= (codes >> _MORTON_AXES * bit + axis & 1) << bit
+            rows[axis] |= (codes >> _AXES * bit + axis & 1) << bit
     return rows
 
 
@@ -299,11 +319,11 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
     """
     params = payload.structure(_spec.CodebookParams, f"{name}.params")
     identity = params.record.codebook_id
-    book, columns = _find_book(reader, params, attribute)
+    book, columns = _find_codebook(reader, params, attribute)
     if first_attribute(book) == attribute:
         first = reader.first[identity] = _read_indices(reader, payload, name, book, params)
     else:
-        first = _find_indices(reader, book, params)
+        first = _find_earlier_indices(reader, book, params)
     summands = None
     has_summand = attribute == _spec.ATTRIBUTE_SCALES
     if has_summand:
@@ -321,8 +341,12 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
         reader.check_scales(max(int(part.max()) for part in parts), 0)
 
 
-def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> tuple[CodebookAt, slice]:
-    """Check CBK-1; return the codebook and the columns of the attribute."""
+def _find_codebook(reader: TileChecker, params: _CodebookParams, attribute: int) -> tuple[CodebookAt, slice]:
+    """Check CBK-1; return the record of the codebook and the columns of the attribute in its entries.
+
+    Raises:
+        UnreadableError: no valid codebook record has the attribute.
+    """
     identity = params.record.codebook_id
     book = reader.index.codebooks.get(identity)
     columns = None if book is None else attribute_columns(book, attribute)
@@ -341,7 +365,7 @@ def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> 
 def _read_indices(
     reader: TileChecker, payload: Payload, name: str, book: CodebookAt, params: _CodebookParams
 ) -> CodebookIndices:
-    """Read indices and check CBK-2 and CBK-3."""
+    """Read the indices of a tile's first block of a codebook, and check CBK-2 and CBK-3."""
     log, size = reader.log, book.record.size
     stream = read_stream(payload, f"{name}.indices", reader.tile.count, _INDEX_WIDTH_MAX)
     indices = stream.elements
@@ -359,14 +383,18 @@ def _read_indices(
     return CodebookIndices(indices, escaped, count)
 
 
-def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams) -> CodebookIndices:
-    """Check CBK-4; return the indices of an earlier block, or unknown indices if there is none."""
+def _find_earlier_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams) -> CodebookIndices:
+    """Check CBK-4; return the indices of the tile's first block of the codebook.
+
+    If there is none, they are unknown, which is no violation if its layer is unreadable. If the numbers of escapes
+    differ, `escaped` is unknown.
+    """
     identity, count = params.record.codebook_id, params.record.escape_count
     first = reader.first.get(identity)
-    opener = first_attribute(book)
-    name = _spec.ATTRIBUTE_NAMES[opener]
+    attribute = first_attribute(book)
+    name = _spec.ATTRIBUTE_NAMES[attribute]
     if first is None:
-        if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
+        if _spec.ATTRIBUTE_LAYER[attribute] not in reader.lost:
             message = f"no preceding block of {name} uses codebook {identity}"
             reader.log.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(None, None, count)
@@ -378,12 +406,12 @@ def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams
 
 
 def _read_summands(reader: TileChecker, payload: Payload, name: str, attribute: int) -> I64 | None:
-    """Read the common summands of scales, [n], and check LAT-2 and LAT-3."""
+    """Read the summands of scales, [n], one for all axes of a splat, and check LAT-2 and LAT-3; `None` if unknown."""
     _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
-    offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
+    offsets, offset_valid = read_offsets(payload, f"{name}.summand.offset", 1)
     width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
     stream = read_stream(payload, f"{name}.summand.stream", reader.tile.count, width_max)
-    if stream.elements is None or not (sound and sane):
+    if stream.elements is None or not (sound and offset_valid):
         return None
     summands: I64 = stream.elements.astype(np.int64) + offsets[0]
     return summands
@@ -392,9 +420,16 @@ def _read_summands(reader: TileChecker, payload: Payload, name: str, attribute: 
 def _read_escapes(
     reader: TileChecker, payload: Payload, name: str, attribute: int, params: _CodebookParams
 ) -> I64 | None:
-    """Read the escapes, [C, escape_count], and check CBK-5 and the clauses of their coding."""
-    what = f"{name}.escape"
-    head = read_block_head(payload, what)
+    """Read the escapes and check BLK-1, CBK-5 and the clauses of their coding.
+
+    Returns:
+        [C, escape_count], `None` if a violation prevents decoding or they are out of range.
+
+    Raises:
+        UnreadableError: the coding is unknown or not allowed for escapes.
+    """
+    escape_name = f"{name}.escape"
+    head = read_block_head(payload, escape_name)
     if head.record.attribute != attribute:
         message = f"{head.record.attribute}, expected that of its block, {attribute}"
         reader.log.add_field("CBK-5", head, "attribute", message)
@@ -408,7 +443,7 @@ def _read_escapes(
         names = " or ".join(_spec.CODING_NAMES[value] for value in legal)
         reader.log.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, expected {names}")
         raise UnreadableError
-    rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
+    rows, _ = read_columns(reader, payload, escape_name, attribute, coding, params.record.escape_count, escape=True)
     return rows
 
 

@@ -60,10 +60,10 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
         UnreadableError: the payload does not consist of whole records.
     """
     log, start = payload.log, payload.at
-    record_count, rest = divmod(payload.left, _spec.NODE_RECORD_SIZE)
-    if rest:
-        payload.at = payload.end - rest
-        message = f"the payload ends within the record, {rest} of {_spec.NODE_RECORD_SIZE} bytes are left"
+    record_count, excess = divmod(payload.left, _spec.NODE_RECORD_SIZE)
+    if excess:
+        payload.at = payload.end - excess
+        message = f"the payload ends within the record, {excess} of {_spec.NODE_RECORD_SIZE} bytes are left"
         log.add("TRE-2", payload.at, f"{payload.name}/node[{record_count}]", message)
         raise UnreadableError
     # Each node has a tile, so one of these nodes breaks TRE-3 if there are more nodes than tiles.
@@ -77,7 +77,10 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
 
 
 def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Tile], start: tuple[int, str]) -> None:
-    """Check TRE-3 and TRE-4, and set levels and numbers of splats if TRE-3 holds."""
+    """Check TRE-3 and TRE-4, and set `level` and `splat_count` of all nodes if TRE-3 holds.
+
+    `start` is the offset and the name to report if the nodes lack tiles.
+    """
     assigned: list[tuple[int | None, int]] = []
     first = 0
     for node in nodes:
@@ -85,11 +88,11 @@ def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Til
         if not 1 <= count <= left:
             log.add_field("TRE-3", node.record, "tile_count", f"{count}, expected 1 or more of {left} left")
             return
-        own = tiles[first : first + count]
-        levels = sorted({tile.level for tile in own})
+        node_tiles = tiles[first : first + count]
+        levels = sorted({tile.level for tile in node_tiles})
         if len(levels) > 1:
             log.add_field("TRE-4", node.record, "tile_count", f"tiles of levels {levels[0]} to {levels[-1]}")
-        assigned.append((levels[0] if len(levels) == 1 else None, sum(tile.count for tile in own)))
+        assigned.append((levels[0] if len(levels) == 1 else None, sum(tile.count for tile in node_tiles)))
         first += count
     if first < len(tiles):
         log.add("TRE-3", *start, f"{first} tiles of all nodes, expected {len(tiles)}")
@@ -123,7 +126,7 @@ def _is_above(nodes: Sequence[_Node], record_count: int, n: int, parent: int) ->
 
 
 def _check_node(log: ViolationLog, node: _Node) -> None:
-    """Check TRE-6 to TRE-8."""
+    """Check TRE-8, and for a node above level 0 whose children are all known TRE-6 and TRE-7."""
     # An error that is invalid by itself does not bound the parent's error.
     least = max((child.error for child in node.children if child.has_valid_error), default=0.0)
     if not node.has_valid_error:

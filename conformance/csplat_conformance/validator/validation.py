@@ -112,7 +112,7 @@ def _check(
         log.skip("everything after magic and version", "not a file of this version")
         return
     _check_length(view, header.record.file_size, log)
-    end = _index_end(view, header, log)
+    end = _find_index_end(view, header, log)
     if end is None:
         log.skip("index and chunks", "the index is incomplete")
         return
@@ -174,14 +174,14 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
 
 
 def _check_length(view: memoryview, size: int, log: ViolationLog) -> None:
-    """Check HDR-5 and HDR-6."""
+    """Check HDR-5 and HDR-6: the data have the `size` that the header declares."""
     if len(view) < size:
         log.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
     elif len(view) > size:
         log.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
 
 
-def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | None:
+def _find_index_end(view: memoryview, header: Header, log: ViolationLog) -> int | None:
     """Check HDR-7 and IDX-1; return the end of the index, `None` if its head does not fit or it exceeds the data."""
     size, file_size = header.record.index_size, header.record.file_size
     least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
@@ -205,7 +205,7 @@ def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | Non
 def _read_directory_chunks(
     view: memoryview, directory: list[Chunk], tiles: list[Tile], index: Index, json_bytes_max: int, log: ViolationLog
 ) -> CodebookEntries:
-    """Read every chunk of the directory, used or not, known or not (CHK-2)."""
+    """Check every whole chunk of the directory, used or not, known or not (CHK-2); return the entries of codebooks."""
     books: CodebookEntries = {}
     tree = find_tree(log, directory, tiles)
     for chunk in directory:
@@ -233,11 +233,14 @@ def _read_tile_chunks(
     log: ViolationLog,
     progress: Callable[[str, float], None],
 ) -> None:
-    """Check the chunks of all tiles; `books` are the codebooks that could be read."""
-    let_go = PageReleaser(view)
+    """Check the whole chunks of all tiles; `books` are the entries of the codebooks that could be read.
+
+    Adds two entries to `log.checks`, even if chunks had to be skipped.
+    """
+    pages = PageReleaser(view)
     for tile in tiles:
         progress(_STAGE, tile.index / len(tiles))
-        let_go.after(sum(chunk.size for chunk in tile.chunks))
+        pages.after(sum(chunk.size for chunk in tile.chunks))
         reader = TileChecker(view, index, tile, books, log)
         for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
             if not chunk.whole:

@@ -27,26 +27,27 @@ def check_integers(log: ViolationLog, index: Index, attribute: int, rows: I64, e
     Returns:
         True if all clauses that could be checked hold.
     """
-    before = len(log.violations)
+    violation_count = len(log.violations)
     placed, levels = index.attributes.get(attribute), index.levels.get(attribute)
     if placed is None or not rows.size:
         return placed is not None
     if _spec.ATTRIBUTE_KIND[attribute] == "lattice":
-        _check_lattice(log, index, placed.record, rows, exponent, where)
+        _check_lattice_range(log, index, placed.record, rows, exponent, where)
     elif levels is not None:
-        check = _check_quats if attribute == _spec.ATTRIBUTE_QUATS else _check_levels
+        check = _check_quat_range if attribute == _spec.ATTRIBUTE_QUATS else _check_level_range
         check(log, rows, levels, where)
-    return len(log.violations) == before
+    return len(log.violations) == violation_count
 
 
-def _check_levels(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
-    high = int(rows.max())
-    if high > levels:
-        log.add("LEV-1", *where, f"a level of {high}, expected at most {levels}")
+def _check_level_range(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
+    """Check LEV-1 of integers [C, n], at least one."""
+    highest = int(rows.max())
+    if highest > levels:
+        log.add("LEV-1", *where, f"a level of {highest}, expected at most {levels}")
 
 
-def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
-    """Check QUA-1 and QUA-2 of integers [3, n]."""
+def _check_quat_range(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
+    """Check QUA-1 and QUA-2 of integers [3, n]; QUA-2 only if QUA-1 holds."""
     largest = max(abs(int(rows.min())), abs(int(rows.max())))
     if largest > levels:
         log.add("QUA-1", *where, f"a component of magnitude {largest}, expected at most {levels}")
@@ -59,13 +60,13 @@ def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> Non
         log.add("QUA-2", *where, message)
 
 
-def _check_lattice(
+def _check_lattice_range(
     log: ViolationLog, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
 ) -> None:
-    """Check LAT-4, and LAT-5 if it holds, of integers [C, n]."""
-    third = len(rows) // 3
+    """Check LAT-4 of integers [C, n], at least one each; LAT-5 if it holds and the step is valid."""
+    luma_count = len(rows) // 3  # of YCOCG: the columns of Y come first, then those of Co and Cg
     for column, row in enumerate(rows):
-        shift = record.chroma_shift if column >= third and record.mapping == _spec.MAPPING_YCOCG else 0
+        shift = record.chroma_shift if column >= luma_count and record.mapping == _spec.MAPPING_YCOCG else 0
         largest = max(abs(int(row.min())), abs(int(row.max()))) << shift
         if largest > _spec.COLUMN_MAX:
             message = f"column {column} has an integer of magnitude {largest}, expected at most {_spec.COLUMN_MAX}"
@@ -76,14 +77,14 @@ def _check_lattice(
     if scale is None:
         return
     if record.mapping == _spec.MAPPING_YCOCG:
-        rows = _lift(rows, record.chroma_shift)
+        rows = _undo_ycocg(rows, record.chroma_shift)
     for extreme in (int(rows.min()), int(rows.max())):
         if not is_finite(extreme, scale):
             log.add("LAT-5", *where, f"{extreme} x {scale} is not finite in binary32")
             return
 
 
-def _lift(rows: I64, chroma_shift: int) -> I64:
+def _undo_ycocg(rows: I64, chroma_shift: int) -> I64:
     """Return R, G, B of Y, Co, Cg, [3 K, n] (7.1). LAT-4 bounds all intermediate values by 2^53."""
     y, co, cg = np.split(rows, 3)
     co, cg = co << chroma_shift, cg << chroma_shift
@@ -109,7 +110,16 @@ def check_box(log: ViolationLog, record: _spec.TileRecord, rows: I64, box: Place
 
 
 def check_max_scale(log: ViolationLog, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
-    """Check TIL-11 bit for bit: NaN differs from everything, and +0 from −0."""
+    """Check TIL-11, if the step is valid, bit for bit: NaN differs from everything, and +0 from −0.
+
+    Args:
+        log: receives the violations.
+        index: index of the file.
+        largest: largest lattice integer of the tile's scales.
+        exponent: exponent of their block.
+        stored: the four bytes of `max_scale`.
+        where: the field `max_scale`.
+    """
     step = index.steps.get(_spec.ATTRIBUTE_SCALES)
     scale = None if step is None else scaled_step(step, exponent)
     if scale is None:

@@ -46,7 +46,7 @@ class _Commands(TyperGroup):
         # An unknown name is compared with all commands, so that the error can suggest one.
         for name in {cmd_name} & _PANEL_OF.keys() or _PANEL_OF:
             if name not in self.commands:
-                self.commands[name] = _imported(name)
+                self.commands[name] = _import_command(name)
         return self.commands.get(cmd_name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
@@ -83,10 +83,11 @@ def _split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return [word for word in words if word == _TRUST_PATHS], [word for word in words if word != _TRUST_PATHS]
 
 
-def _imported(name: str) -> Any:
-    """Import the command of a name, or a group of commands."""
+def _import_command(name: str) -> Any:
+    """Import the command of a name, or a group of commands, as click's command."""
     panel = _PANEL_OF[name]
     definition = getattr(import_module(f"csplat_tools.cli.{_PANELS[panel][name]}"), name.replace("-", "_"))
+    # An application of this command alone: other modules need not be imported to make it.
     alone = typer.Typer(rich_markup_mode="rich")
     if isinstance(definition, typer.Typer):
         alone.add_typer(definition, name=name, rich_help_panel=panel)
@@ -116,6 +117,7 @@ app = typer.Typer(
 
 
 def _version(requested: bool) -> None:
+    """Print the versions and exit, if requested."""
     if requested:
         print_data(VERSIONS)
         raise typer.Exit

@@ -106,24 +106,28 @@ def decoder(
     patterns = [pattern.strip() for text in filters or () for pattern in text.split(",")]
     clauses = [pattern for pattern in patterns if _CLAUSE.fullmatch(pattern)]
     names = [pattern for pattern in patterns if pattern not in clauses]
-    program, render_program, cut_program = _commands(programs or [])
+    program, render_program, cut_program = _sort_commands(programs or [])
     # The commands that are given select the default: a renderer alone is tested at L4 alone.
     more = [str(number) for number, given in ((RENDERS, render_program), (CUTS, cut_program)) if given is not None]
     levels = shared.checked(parse_levels, level or ",".join(["1", "2", "3", *more]))
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or TIMEOUT_SECONDS
     options = shared.checked(
-        DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by
+        DecoderSuiteOptions, _join_patterns(names), _join_patterns(clauses), levels, timeout=seconds, jobs=jobs, by=by
     )
     with out.bar() as bar:
         if not programs:
-            result = run_builtin(options, _moved(bar))
+            result = run_builtin(options, _bar_mover(bar))
         else:
-            result = run_command(program, options, render=render_program, cuts=cut_program, progress=_moved(bar))
+            result = run_command(program, options, render=render_program, cuts=cut_program, progress=_bar_mover(bar))
     _publish(result, out, junit, "no vector is chosen")
 
 
-def _commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
-    """Return the commands of a decoder, a renderer and cuts by their names in braces, each `None` if not given."""
+def _sort_commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
+    """Return the commands of a decoder, a renderer and cuts by their names in braces, each `None` if not given.
+
+    Raises:
+        typer.BadParameter: two commands are of one kind.
+    """
     by_kind: dict[str, str] = {}
     for program in programs:
         kind = next((kind for kind in ("cuts", "camera") if f"{{{kind}}}" in program), "decoder")
@@ -185,7 +189,7 @@ def encoder(
     )  # fmt: skip
     _check_reports(out, junit)
     if folder is not None:
-        made = write_inputs(_checked_folder(folder, force=out.force), _joined(filters))
+        made = write_inputs(_checked_folder(folder, force=out.force), _join_patterns(filters))
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
     levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4", last=4))
@@ -193,11 +197,11 @@ def encoder(
     render_score, reason = _render_scorer(levels, quiet=out.quiet)
     least = PSNR_MIN if min_psnr is None else min_psnr
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or ENCODER_SECONDS
-    options = EncoderSuiteOptions(_joined(filters), levels, seconds, least, jobs, kept)
+    options = EncoderSuiteOptions(_join_patterns(filters), levels, seconds, least, jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
         result = run_encoder(
-            program or ours, options, render_score=render_score, no_render_reason=reason, progress=_moved(bar)
+            program or ours, options, render_score=render_score, no_render_reason=reason, progress=_bar_mover(bar)
         )
     _publish(result, out, junit, "no input is chosen")
 
@@ -233,15 +237,22 @@ def _publish(report: ConformanceReport, out: Output, junit: str | None, nothing:
         raise typer.Exit(EXIT_FAILED)
 
 
-def _joined(patterns: Sequence[str] | None) -> str | None:
+def _join_patterns(patterns: Sequence[str] | None) -> str | None:
+    """Join patterns by commas; `None` without any."""
     return ",".join(patterns) if patterns else None
 
 
-def _moved(bar: Progress) -> Callable[[int, int], None]:
+def _bar_mover(bar: Progress) -> Callable[[int, int], None]:
+    """Return a callback for the number of finished tests and of all, which moves a progress bar."""
     return lambda done, count: bar("conformance", done / count)
 
 
 def _checked_folder(name: str, *, force: bool) -> Path:
+    """Return the path of a folder to write to, which need not exist.
+
+    Raises:
+        InputError: it is a file, or it is not empty and `force` is not set.
+    """
     folder = Path(name)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{name} is a file, expected a folder")
@@ -269,6 +280,7 @@ def _render_scorer(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore |
         ready()
 
     def psnr(source: SplatModel, decoded: SplatModel) -> float:
+        """Return the PSNR of renders of two scenes, dB; prepares the renderer at the first call."""
         ready()
         from csplat_render.scorer import Scorer
         from csplat_tools.views import comparison_cameras

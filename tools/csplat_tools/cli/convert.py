@@ -80,7 +80,7 @@ def convert(
     out = Output(force, report, as_json, quiet)
     if output == STANDARD_STREAM:
         raise typer.BadParameter("OUT cannot be standard output: name a file")
-    filters, overrides = _filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
+    filters, overrides = _parse_filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
     filters = replace(filters, drop_floaters=drop_floaters, sh_degree=shared.parse_sh_degree(sh_degree))
     chosen, max_splats = shared.parse_level(level)
     folder = Path(output).parent
@@ -124,7 +124,10 @@ def _filter_axes(source: str, made: Conversion, *, chosen: bool) -> str:
     return f"the axes of {source}, {named}; --to-axes chooses others"
 
 
-def _filters(
+_BOX_NUMBERS, _SPHERE_NUMBERS = 6, 4  # two corners; centre and radius
+
+
+def _parse_filters(
     to_axes: str | None, rotate: str | None, scale: float | None, translate: str | None, crop: str | None
 ) -> Filters:
     """Return the filters for values of options.
@@ -135,8 +138,8 @@ def _filters(
     if scale is not None and not (math.isfinite(scale) and scale > 0.0):
         raise typer.BadParameter(f"--scale is {scale:g}, expected a number above 0")
     turn, offset = shared.parse_numbers("--rotate", rotate, 3), shared.parse_numbers("--translate", translate, 3)
-    region = shared.parse_numbers("--crop", crop, 6, 4)
-    is_box = region is not None and len(region) == 6
+    region = shared.parse_numbers("--crop", crop, _BOX_NUMBERS, _SPHERE_NUMBERS)
+    is_box = region is not None and len(region) == _BOX_NUMBERS
     if region is not None and not is_box and region[3] <= 0.0:
         raise typer.BadParameter(f"--crop has a radius of {region[3]:g}, expected one above 0")
     return Filters(

@@ -157,14 +157,21 @@ def encode(
             scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
             source_index=source_index, levels=level_count, format=read_as, context=context,
         )  # fmt: skip
-        _publish(encoded, source, output, out, up=up)
+        _publish_encoded(encoded, source, output, out, up=up)
         if level_count is None:
             written = encoded.source.changed(count=encoded.result.report.splat_count)
             out.remark(*describe_levels(written, options, context))
 
 
-def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up: str | None) -> None:
-    """Publish the result."""
+def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output, *, up: str | None) -> None:
+    """Print findings, notes, the search, errors and a line on sizes, and write the report.
+
+    Args:
+        encoded: the written file.
+        source, output: names of the files.
+        out: where to print.
+        up: the up direction that the user gave, or `None`.
+    """
     report, model = encoded.result.report, encoded.source.in_memory
     out.print_findings(encoded.source.findings)
     for line in report.notes:
@@ -185,7 +192,7 @@ def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up:
 def _publish_estimate(
     source: str, read_as: str | None, options: EncodeOptions, context: Context, levels: LevelCount, out: Output
 ) -> None:
-    """Report memory, disk space and time that an encoding would take."""
+    """Report memory, disk space and time that an encoding would take; writes no .csplat file."""
     with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:
         cost = estimate_cost(scene, options, context, choose_levels(scene.count, options, levels))
         lines = describe_levels(scene, options, context) if levels is None else []

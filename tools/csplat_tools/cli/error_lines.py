@@ -78,14 +78,14 @@ def report_errors() -> Iterator[None]:
         with named_errors(STANDARD_OUTPUT):
             sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
     except CsplatError as error:
-        _fail(_csplat_error(error), error.code)
+        _fail(_describe_csplat_error(error), error.code)
     except BrokenPipeError:
         _drop_stdout()
         raise typer.Exit(EXIT_FAILED) from None
     except OSError as error:
         if error.filename == STANDARD_OUTPUT:
             _drop_stdout()
-        _fail(_os_error(error), errno.errorcode.get(error.errno or 0, ""))
+        _fail(_describe_os_error(error), errno.errorcode.get(error.errno or 0, ""))
     except MemoryError:
         _fail("out of memory", "")
     except KeyboardInterrupt:
@@ -109,12 +109,13 @@ def refuse_command_line(error: Any) -> NoReturn:
 
 
 def _fail(message: str, code: str) -> NoReturn:
+    """Print an error in one line, with its code unless the message has it or it is empty, and exit with status 1."""
     message = " ".join(message.split())
     note(f"error: {message}" + (f" ({code})" if code and not re.search(rf"\b{code}\b", message) else ""))
     raise typer.Exit(EXIT_FAILED) from None
 
 
-def _csplat_error(error: CsplatError) -> str:
+def _describe_csplat_error(error: CsplatError) -> str:
     """Return the message of an error: the file, the defect in plain words, the details, and the remedy."""
     what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
     if isinstance(error, LimitError) and error.limit == "json_bytes":
@@ -125,7 +126,8 @@ def _csplat_error(error: CsplatError) -> str:
     return ": ".join(parts) + (f"; {advice}" if advice else "")
 
 
-def _os_error(error: OSError) -> str:
+def _describe_os_error(error: OSError) -> str:
+    """Return the message of an error of the system: the file if it is known, the reason, and the remedy if any."""
     reason = error.strerror or str(error) or type(error).__name__
     number = error.errno or 0
     name = None if error.filename is None else os.fsdecode(error.filename)

@@ -52,7 +52,7 @@ def lint(
             with csplat.open(path) as scene:
                 write_model(fix, scene if keep_extra else scene.without_extra(), absolute=False)
     clean = all(finding.kind == "note" for finding in findings)
-    table = _table(findings)
+    table = _format_findings(findings)
     if fix == STANDARD_STREAM:
         out.remark(table)
     result = {"clean": clean, "fixed": fix is not None and not errors, "findings": findings_as_json(findings)}
@@ -63,7 +63,8 @@ def lint(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _table(findings: list[Finding]) -> str:
+def _format_findings(findings: list[Finding]) -> str:
+    """Format findings as a table, or as a remark that there are none; texts follow their rows."""
     if not findings:
         return "nothing found"
     rows = [(f"{finding.kind:<6}  {finding.id}", finding.count) for finding in findings]

@@ -39,6 +39,7 @@ _NAMED_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def _print_full_help(context: typer.Context, requested: bool) -> None:
+    """Print the help of a command with its hidden options, and exit, if requested."""
     if requested and not context.resilient_parsing:
         for option in context.command.params:
             option.hidden = False  # type: ignore[attr-defined]  # arguments have it, too
@@ -489,12 +490,22 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
             raise InputError(f"{part.strip()!r} is not an error bound, expected a measure and a number: means=0.001")
         if name in bounds:
             raise InputError(f"the largest error of {name} is given twice")
-        bounds[name] = float(match[1]) * _factor(part.strip(), name, match[2], unit_metres)
+        bounds[name] = float(match[1]) * _unit_factor(part.strip(), name, match[2], unit_metres)
     return bounds
 
 
-def _factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:
-    """Return the factor that converts a number with a unit to scene units."""
+def _unit_factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:
+    """Return the factor that converts a number with a unit to scene units.
+
+    Args:
+        part: the user's text, for messages.
+        name: the measure; only `means` has a unit.
+        unit: the unit; empty for scene units.
+        unit_metres: length of a scene unit in metres; `None` if unknown.
+
+    Raises:
+        InputError: the unit is unknown or not allowed, or the scene's unit is unknown.
+    """
     if not unit:
         return 1.0
     if name != "means" or unit not in _LENGTHS:

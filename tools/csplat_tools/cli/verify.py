@@ -58,6 +58,7 @@ def verify(
 
 
 def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> None:
+    """Print why a file fails: violations, errors that were not checked, and declared errors that do not hold."""
     violations = verified.validation.violations
     if violations:
         clauses, codes = (

@@ -74,7 +74,7 @@ def view(
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.print_findings(scene.findings)
-            out.remark(*_encoded(scene, _PRESETS[0]))
+            out.remark(*_encoding_lines(scene, _PRESETS[0]))
             out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
             out.remark("Ctrl-C ends this.")
@@ -123,7 +123,7 @@ def export_html(
         exported = viewer_page.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.print_findings(scene.findings)
-        out.remark(*_encoded(scene, _PRESETS[1]))
+        out.remark(*_encoding_lines(scene, _PRESETS[1]))
     out.remark(
         f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
         f" (its file and a third), page and decoder {format_bytes(exported.code_bytes)}"
@@ -172,7 +172,8 @@ def _scene_parameters(scene: ViewerScene, cameras: str | None, up: str | None, o
     return wishes | estimated_up_parameters(shared.take_estimated_up(scene.seems_up, out, up=up))
 
 
-def _encoded(scene: ViewerScene, preset: str) -> list[str]:
+def _encoding_lines(scene: ViewerScene, preset: str) -> list[str]:
+    """Return a line on the encoding of a scene; none if it was a .csplat file."""
     if not scene.encoded_from:
         return []
     sizes = f"{format_bytes(scene.encoded_from)} -> {format_bytes(scene.size_bytes)}"

@@ -201,7 +201,7 @@ def compare(
             viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
         first: SplatModel | Renderable
         second: SplatModel | Renderable
-        first, second, errors = _measure(source, other, views.test, bound, source_index, context)
+        first, second, errors = _prepare_scenes(source, other, views.test, bound, source_index, context)
         if prepare is not None:
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
@@ -294,25 +294,39 @@ def attribute_errors_out_of_core(
 
 
 def _paired_blocks(a: Scene, b: Scene, progress: Progress) -> Iterator[tuple[int, SplatModel, SplatModel]]:
-    """Yield paired blocks of two scenes in the same order, with the index of the first splat."""
-    first = a.with_progress("measuring splats", progress).blocks()
-    second = b.with_progress("", null_progress).blocks()
-    start, ours, theirs = 0, a.empty(), b.empty()
+    """Yield blocks of two scenes that have the same number of splats in the same order.
+
+    Args:
+        a, b: the scenes, whose own blocks may differ in size.
+        progress: receives the progress of `a`.
+
+    Yields:
+        The index of the first splat, and as many splats of `a` as of `b`, at least one.
+    """
+    blocks_a = a.with_progress("measuring splats", progress).blocks()
+    blocks_b = b.with_progress("", null_progress).blocks()
+    start, part_a, part_b = 0, a.empty(), b.empty()  # splats that were read, but not yielded
     while start < a.count:
-        ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
-        count = min(len(ours), len(theirs))
-        if count:
-            yield start, ours.select(slice(0, count)), theirs.select(slice(0, count))
-        ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
+        part_a = part_a if len(part_a) else next(blocks_a)
+        part_b = part_b if len(part_b) else next(blocks_b)
+        count = min(len(part_a), len(part_b))
+        if count:  # a block may be empty
+            yield start, part_a.select(slice(0, count)), part_b.select(slice(0, count))
+        part_a, part_b = part_a.select(slice(count, None)), part_b.select(slice(count, None))
+        start += count
 
 
 def _errors(source: Source, other: SplatModel, index: NDArray[Any], context: Context) -> dict[str, tuple[float, float]]:
+    """Return the largest and the rms error by measure; `index`, [N], has each splat's index in the source."""
     measured = measure_pairs(source, other, index, context=context)
     return {name: (error.max, error.rms) for name, error in measured.items()}
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
-    """Return True if both scenes have the same order; in a shuffled scene half of the pairs are far apart."""
+    """Return True if both scenes seem to have the same order; in a shuffled scene half of the pairs are far apart.
+
+    Return False for scenes of different numbers of splats, and without splats.
+    """
     if len(source) != len(other) or not len(source):
         return False
     means = source.means.astype(np.float64)
@@ -323,11 +337,12 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
 
 
 def _views(source: Scene, background: Colour | None, context: Context) -> ViewSet:
+    """Return the views of a scene, of which only a sample is read; none are for training."""
     model, every = sample_scene(source, progress=context.progress)
     return find_view_set(model, background=background, count=0, every=every)
 
 
-def _measure(
+def _prepare_scenes(
     source: Scene,
     other: Scene,
     cameras: Sequence[Camera],
@@ -335,17 +350,31 @@ def _measure(
     source_index: NDArray[np.integer[Any]] | None,
     context: Context,
 ) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
-    """Return both scenes in a form to render, and the errors of B's splats."""
+    """Return both scenes in a form to render, sliced on disk unless both are in memory, and the errors of B's splats.
+
+    Args:
+        source, other: scenes A and B.
+        cameras: the views, whose renders of A are kept in memory.
+        memory_bytes: memory for splats and renders.
+        source_index: [N], the index in A of each splat of B; `None`: by order, if it is the same.
+        context: threads and progress.
+
+    Returns:
+        A, B and the errors; `None` for errors if the splats cannot be paired.
+
+    Raises:
+        InputError: memory or disk space do not suffice to render the scenes.
+    """
     if source.in_memory is not None and other.in_memory is not None:
         return source.in_memory, other.in_memory, attribute_errors(source, other, source_index, context=context)
-    kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
+    render_bytes = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
     first, second = (
-        SlicedScene(scene, *sample_scene(scene, progress=context.progress), memory_bytes - kept)
+        SlicedScene(scene, *sample_scene(scene, progress=context.progress), memory_bytes - render_bytes)
         for scene in (source, other)
     )
     for scene in (first, second):
         if scene.memory_bytes < scene.least_bytes:
-            bound, least = (scene.memory_bytes + kept) / 1e6, (scene.least_bytes + kept) / 1e6
+            bound, least = (scene.memory_bytes + render_bytes) / 1e6, (scene.least_bytes + render_bytes) / 1e6
             raise InputError(f"the memory is {bound:,.0f} MB, expected at least {least:,.0f} MB to draw these scenes")
     check_free_space(
         temporary_root(),
@@ -356,6 +385,11 @@ def _measure(
 
 
 def _on_gpu(scene: SplatModel | Renderable, device: Device) -> GpuScene:
+    """Return a scene in memory for a GPU.
+
+    Raises:
+        InputError: the scene is not in memory.
+    """
     if not isinstance(scene, SplatModel):
         raise InputError("a GPU renders scenes in memory, and they do not fit: use the backend cpu")
     return GpuScene(device, [scene])
@@ -392,6 +426,8 @@ class _ImageWriter:
 
 
 def _all_of(viewers: Sequence[OnView]) -> OnView:
+    """Return a callback that calls these callbacks in turn."""
+
     def show(number: int, a: F32, b: F32) -> None:
         for viewer in viewers:
             viewer(number, a, b)

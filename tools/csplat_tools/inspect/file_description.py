@@ -221,14 +221,14 @@ def describe_file(data: bytes | mmap) -> FileDescription:
     """
     header = read_header(data)
     use = attribute_usage(data, header)
-    attributes = {name: _attribute(header, name, usage) for name, usage in use.items()}
+    attributes = {name: _summarise_attribute(header, name, usage) for name, usage in use.items()}
     return FileDescription(
         header,
         attributes,
-        _layers(header),
-        _levels(data, header),
-        [_codebook(header, record) for record in header.codebooks],
-        _overhead(header, use),
+        _summarise_layers(header),
+        _summarise_levels(data, header),
+        [_summarise_codebook(header, record) for record in header.codebooks],
+        _overhead_sizes(header, use),
         read_metadata(data),
         read_options(data),
         read_declared_bounds(data),
@@ -288,7 +288,10 @@ def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int
         FormatError: heads contradict each other.
     """
     use = attribute_usage(data, header)
-    return {**{name: usage.size_bytes for name, usage in use.items()}, "overhead": sum(_overhead(header, use).values())}
+    return {
+        **{name: usage.size_bytes for name, usage in use.items()},
+        "overhead": sum(_overhead_sizes(header, use).values()),
+    }
 
 
 def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
@@ -333,7 +336,7 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
     """Describe the scene in words, by title."""
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata)
-    words["tiles"] = _tiles(file)
+    words["tiles"] = _describe_tiles(file)
     extras = ", ".join(f"{extra.name} ({extra.dtype or 'unknown type'})" for extra in header.extras)
     if extras:
         words["extra"] = extras
@@ -392,11 +395,12 @@ def other_metadata(file: FileDescription) -> dict[str, object]:
     return {key: value for key, value in metadata.entries.items() if not described.get(key)}
 
 
-def _bits(size_bytes: int, count: int) -> float | None:
+def _bits_per_splat(size_bytes: int, count: int) -> float | None:
+    """Return bits per splat; `None` without splats."""
     return 8.0 * size_bytes / count if count else None
 
 
-def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> AttributeSummary:
+def _summarise_attribute(header: SceneHeader, name: str, use: AttributeUsage) -> AttributeSummary:
     """Return the summary of an attribute; one without a record has no mapping, step or levels."""
     record = next((entry for entry in header.attributes if _spec.ATTRIBUTE_NAMES[entry.attribute] == name), None)
     known: dict[str, Any] = {}
@@ -409,7 +413,7 @@ def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> Attribute
     return AttributeSummary(
         use.size_bytes,
         use.codebook_bytes,
-        _bits(use.size_bytes, header.splat_count),
+        _bits_per_splat(use.size_bytes, header.splat_count),
         dict(use.codings),
         dict(use.coders),
         use.escaped_count,
@@ -417,7 +421,7 @@ def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> Attribute
     )
 
 
-def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
+def _summarise_layers(header: SceneHeader) -> dict[str, LayerSummary]:
     """Return the layers by name, ascending by id, with their codebook chunks; "layer 128" for an unknown id."""
     tile_bytes, tile_count, codebook_bytes = Counter[int](), Counter[int](), Counter[int]()
     for tile in header.all_tiles:
@@ -430,13 +434,13 @@ def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
     sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
     return {
         _spec.LAYER_NAMES.get(id_, f"layer {id_}"): LayerSummary(
-            size, codebook_bytes[id_], _bits(size, header.splat_count), tile_count[id_]
+            size, codebook_bytes[id_], _bits_per_splat(size, header.splat_count), tile_count[id_]
         )
         for id_, size in sizes.items()
     }
 
 
-def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
+def _summarise_levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
     """Return the levels of detail, finest first; empty if level 0 is the only level."""
     if not header.coarse_tiles:
         return []
@@ -452,7 +456,7 @@ def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
     return levels
 
 
-def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
+def _overhead_sizes(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
     """Return the bytes outside attributes, by name; together with those of all attributes they are the file's size.
 
     Chunks of one type, of which a file may have several if it is unknown, are added up. "unknown_layers", if there are
@@ -467,11 +471,11 @@ def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[st
     parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **by_type}
     if unknown:
         parts["unknown_layers"] = unknown
-    rest = header.file_size - sum(parts.values()) - sum(usage.size_bytes for usage in use.values())
-    return {**parts, "tile_frames": rest}
+    frames = header.file_size - sum(parts.values()) - sum(usage.size_bytes for usage in use.values())
+    return {**parts, "tile_frames": frames}
 
 
-def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSummary:
+def _summarise_codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSummary:
     """Return the summary of a codebook; only codebooks of SH have bands."""
     chunks = [chunk for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK]
     return CodebookSummary(
@@ -495,7 +499,7 @@ def _bounds_as_json(bounds: DeclaredBounds) -> dict[str, Any]:
 
 
 class _Cursor:
-    """A position in the payload of a chunk."""
+    """A position in the payload of a chunk; `at` and `end` are offsets in the file, bytes."""
 
     def __init__(self, data: bytes | mmap, offset: int, size: int) -> None:
         self.data = data
@@ -503,6 +507,7 @@ class _Cursor:
         self.end = offset + size
 
     def take(self, size: int) -> bytes:
+        """Return the next `size` bytes, and step over them; raise a `FormatError` if the payload has fewer."""
         data = self.data[self.at : self.at + size]
         self.skip(size)
         return data
@@ -517,14 +522,18 @@ class _Cursor:
 
 
 def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], use: dict[int, AttributeUsage]) -> None:
-    """Add the blocks of a layer to the usage by attribute id; the cursor is at the tile head."""
+    """Add the blocks of a layer to the usage by attribute id; the cursor is at the tile head.
+
+    Raises:
+        FormatError: an id is unknown, a codebook is missing, or the payload ends early.
+    """
     head = _spec.unpack_tile_head(cursor.take(_spec.TILE_HEAD_SIZE))
     for _ in range(head.block_count):
         start = cursor.at
         block = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
-        _name(_spec.ATTRIBUTE_NAMES, block.attribute, "attribute", start)
+        _registered_name(_spec.ATTRIBUTE_NAMES, block.attribute, "attribute", start)
         usage = use.setdefault(block.attribute, AttributeUsage())
-        usage.codings[_name(_spec.CODING_NAMES, block.coding, "coding", start)] += 1
+        usage.codings[_registered_name(_spec.CODING_NAMES, block.coding, "coding", start)] += 1
         _walk_coding(cursor, block.attribute, block.coding, codebooks, usage)
         usage.block_bytes += cursor.at - start
 
@@ -532,7 +541,11 @@ def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], u
 def _walk_coding(
     cursor: _Cursor, attribute: int, coding: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
 ) -> None:
-    """Step over parameters and streams of a block, after its head, and add their coders to `use`."""
+    """Step over parameters and streams of a block, after its head, and add their coders to `use`.
+
+    Raises:
+        FormatError: as for `_walk_tile`.
+    """
     columns = _spec.ATTRIBUTE_COLUMNS.get(attribute, 1)
     if coding == _spec.CODING_MORTON:
         cursor.skip(_spec.MORTON_PARAMS_SIZE)
@@ -554,12 +567,16 @@ def _walk_coding(
 def _walk_codebook(
     cursor: _Cursor, attribute: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
 ) -> None:
-    """Step over a CODEBOOK block, after its head, with its escape block; add coders and escapes to `use`."""
-    at = cursor.at
+    """Step over a CODEBOOK block, after its head, with its escape block; add coders and escapes to `use`.
+
+    Raises:
+        FormatError: the codebook is missing, the escape block has coding CODEBOOK, or as for `_walk_tile`.
+    """
+    start = cursor.at
     params = _spec.unpack_codebook_params(cursor.take(_spec.CODEBOOK_PARAMS_SIZE))
     record = codebooks.get(params.codebook_id)
     if record is None:
-        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-1", found=f"codebook {params.codebook_id}")
+        raise FormatError(_spec.ERROR_CODEBOOK, start, "CBK-1", found=f"codebook {params.codebook_id}")
     if attribute == _first_attribute(record, record.band_first):
         _walk_stream(cursor, use)
     if attribute == _spec.ATTRIBUTE_SCALES:
@@ -575,9 +592,9 @@ def _walk_codebook(
 
 def _walk_stream(cursor: _Cursor, use: AttributeUsage) -> None:
     """Step over a stream, and add its coder to `use`."""
-    at = cursor.at
+    start = cursor.at
     head = _spec.unpack_stream_head(cursor.take(_spec.STREAM_HEAD_SIZE))
-    use.coders[_name(_spec.CODER_NAMES, head.coder, "coder", at)] += 1
+    use.coders[_registered_name(_spec.CODER_NAMES, head.coder, "coder", start)] += 1
     cursor.skip(head.coded_size)
 
 
@@ -590,13 +607,24 @@ def _first_attribute(record: _spec.CodebookRecord, band: int) -> int:
     return next(id_ for id_, attribute in _spec.ATTRIBUTE_NAMES.items() if attribute == name)
 
 
-def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
+def _registered_name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
+    """Return the registered name of an id.
+
+    Args:
+        names: names by id.
+        id_: the id.
+        what: kind of the id, for the message.
+        offset: its offset in the file, for the message.
+
+    Raises:
+        FormatError: the id is unknown.
+    """
     if id_ not in names:
         raise FormatError(_spec.ERROR_UNSUPPORTED, offset, "RES-2", found=f"{what} {id_}")
     return names[id_]
 
 
-def _tiles(file: FileDescription) -> str:
+def _describe_tiles(file: FileDescription) -> str:
     """Describe number, sizes, precision and exponents of the tiles of level 0 in words."""
     words = {
         name: str(span.min) if span.min == span.max else f"{span.min} to {span.max}"

@@ -94,13 +94,18 @@ def write_page(
         OSError: the source cannot be read, or the report cannot be written.
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
-    comparison = None if source is None else _compare(data, source, context)
+    comparison = None if source is None else _compare_with_source(data, source, context)
     write_bytes(path, make_page(title, description, comparison).encode())
 
 
 def make_page(title: str, description: FileDescription, comparison: _SourceComparison | None = None) -> str:
     """Return the report as HTML: the same for the same file and source."""
-    parts = [_bytes(description), _layers(description), _bounds(description.declared_bounds), _scene(description)]
+    parts = [
+        _bytes_section(description),
+        _layers_section(description),
+        _bounds_section(description.declared_bounds),
+        _scene_section(description),
+    ]
     if comparison is not None:
         measured, images = html.definitions(comparison.measurements), comparison.images
         parts.insert(0, html.section("Comparison with the source", measured, "<h3>The hardest place</h3>", images))
@@ -108,8 +113,18 @@ def make_page(title: str, description: FileDescription, comparison: _SourceCompa
     return html.document(f"{title}: content", parts, summary)
 
 
-def _compare(data: bytes | mmap, source: str, context: Context) -> _SourceComparison:
-    """Score renders of the file on the views of `psnr`, and find the hardest place in views that show the scene."""
+def _compare_with_source(data: bytes | mmap, source: str, context: Context) -> _SourceComparison:
+    """Score renders of the file on the views of `psnr`, and find the hardest place in views that show the scene.
+
+    Args:
+        data: bytes of the file.
+        source: path of the source, or `-`.
+        context: threads and progress.
+
+    Raises:
+        CsplatError: the file or the source is not valid.
+        OSError: the source cannot be read.
+    """
     from csplat_render.scorer import Scorer
     from csplat_tools.views import display_cameras, find_view_set
 
@@ -134,8 +149,8 @@ def _compare(data: bytes | mmap, source: str, context: Context) -> _SourceCompar
     return _SourceComparison(measurements, images)
 
 
-def _bytes(description: FileDescription) -> str:
-    """Return the section on the bytes of each attribute, and of everything else."""
+def _bytes_section(description: FileDescription) -> str:
+    """Return the section on the bytes of each attribute, and of everything else as "overhead"."""
     sizes = {name: attribute.size_bytes for name, attribute in description.attributes.items()}
     sizes["overhead"] = sum(description.overhead.values())
     rows = [
@@ -143,7 +158,7 @@ def _bytes(description: FileDescription) -> str:
             name,
             _ATTRIBUTES.get(name, ""),
             f"{attribute.size_bytes:,}",
-            _bits(attribute.bits_per_splat),
+            _format_bits(attribute.bits_per_splat),
             describe_coding(attribute),
         )
         for name, attribute in description.attributes.items()
@@ -154,8 +169,8 @@ def _bytes(description: FileDescription) -> str:
     return html.section("Bytes by attribute", html.attribute_figure(sizes), html.table(head, rows, words=(1, 4)))
 
 
-def _layers(description: FileDescription) -> str:
-    """Return the section on the layers."""
+def _layers_section(description: FileDescription) -> str:
+    """Return the section on the layers; empty if the file has none."""
     size = description.header.file_size
     rows = [
         (name, _LAYERS.get(name, ""), f"{layer.size_bytes:,}", f"{100.0 * layer.size_bytes / size:.1f} %")
@@ -165,7 +180,7 @@ def _layers(description: FileDescription) -> str:
     return html.section("Layers, in order of arrival", html.table(head, rows, words=(1,)) if rows else "")
 
 
-def _bounds(bounds: DeclaredBounds | None) -> str:
+def _bounds_section(bounds: DeclaredBounds | None) -> str:
     """Return the section on declared error bounds; empty if there are none."""
     if bounds is None:
         return ""
@@ -184,7 +199,7 @@ def _bounds(bounds: DeclaredBounds | None) -> str:
     return html.section("Declared error bounds", f"<p>{escape(text)} {_CHECK}</p>", errors)
 
 
-def _scene(description: FileDescription) -> str:
+def _scene_section(description: FileDescription) -> str:
     """Return the section on the scene, its options and other metadata."""
     words = {
         (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value
@@ -196,5 +211,6 @@ def _scene(description: FileDescription) -> str:
     return html.section("The scene", html.definitions(words))
 
 
-def _bits(value: float | None) -> str:
+def _format_bits(value: float | None) -> str:
+    """Format a number of bits to two decimals; empty if it is unknown."""
     return "" if value is None else f"{value:.2f}"

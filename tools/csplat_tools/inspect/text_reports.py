@@ -64,7 +64,7 @@ def format_comparison(compared: Comparison, a: str, b: str) -> str:
 
 
 def _scene_sizes(compared: Comparison, a: str, b: str) -> str:
-    """Format sizes of two scenes, and their ratio."""
+    """Format the sizes of two scenes named `a` and `b` as a table, and their ratio as a line below."""
     rows = []
     for name, scene in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
         count = scene.count
@@ -85,7 +85,10 @@ def _attribute_errors(attributes: AttributeErrors) -> str:
 
 
 def _scores(compared: Comparison) -> str:
-    """Format the scores of renders, one line each with an explanation."""
+    """Format the scores of renders, one line each with an explanation; scores that were not measured are left out.
+
+    Lines on splats that are not drawn, and on different antialiasing, follow.
+    """
     quality = compared.quality
     values = {
         "psnr": f"{quality.psnr:.2f} dB",
@@ -130,7 +133,7 @@ def format_description(description: FileDescription) -> str:
     """Format the description of a file: scene, sizes, codebooks, declared errors, options, metadata."""
     size = description.header.file_size
     parts = [
-        _scene(description),
+        _scene_lines(description),
         _entry_sizes(
             "attribute",
             description.attributes,
@@ -144,7 +147,7 @@ def format_description(description: FileDescription) -> str:
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in description.overhead.items()),
     ]
     if description.codebooks:
-        parts.append("\n".join(_codebook(codebook) for codebook in description.codebooks))
+        parts.append("\n".join(_codebook_line(codebook) for codebook in description.codebooks))
     if description.declared_bounds is not None:
         parts.append(_declared_errors(description.declared_bounds))
     parts += [
@@ -156,7 +159,7 @@ def format_description(description: FileDescription) -> str:
 
 
 def _level_table(levels: Sequence[LevelSummary]) -> str:
-    """Format the levels of detail."""
+    """Format the levels of detail as a table, with least and largest error of each."""
     rows = [
         (
             str(level.level), level.size_bytes, level.splats, level.nodes, level.tiles,
@@ -167,7 +170,8 @@ def _level_table(levels: Sequence[LevelSummary]) -> str:
     return format_table(("level", "bytes", "splats", "nodes", "tiles", "errors, scene units"), rows)
 
 
-def _scene(description: FileDescription) -> str:
+def _scene_lines(description: FileDescription) -> str:
+    """Format the headline of a file, and a line for each entry on the scene."""
     return "\n".join(
         [format_headline(description), *(f"{name:12} {value}" for name, value in describe_scene(description).items())]
     )
@@ -176,7 +180,14 @@ def _scene(description: FileDescription) -> str:
 def _entry_sizes(
     title: str, entries: Mapping[str, AttributeSummary | LayerSummary], file_size: int, remarks: Sequence[str]
 ) -> str:
-    """Format sizes of attributes or layers, each with its remark at the end of the line."""
+    """Format sizes of attributes or layers as a table, with a remark at the end of each line.
+
+    Args:
+        title: heading of the names.
+        entries: attributes or layers by name.
+        file_size: bytes of the file, above 0.
+        remarks: one for each entry; may be empty.
+    """
     rows = [
         (
             name,
@@ -190,7 +201,8 @@ def _entry_sizes(
     return "\n".join(f"{line}  {text}".rstrip() for line, text in zip(lines, ["", *remarks], strict=True))
 
 
-def _codebook(codebook: CodebookSummary) -> str:
+def _codebook_line(codebook: CodebookSummary) -> str:
+    """Format a codebook as a line: id, kind, SH bands if it has any, entries and bytes."""
     bands = f" bands {codebook.bands[0]} to {codebook.bands[-1]}" if codebook.bands else ""
     size = f"{counted(codebook.entries, 'entry', 'entries')}, {counted(codebook.size_bytes, 'byte')}"
     return f"codebook {codebook.id}: {codebook.kind}{bands}, {size}"
@@ -219,7 +231,7 @@ def format_verification(verified: Verification) -> str:
         lines.append(f"intact: {counted(validation.splat_count, 'splat')}; checked: {', '.join(validation.checks)}")
     if bounds is not None:
         if bounds.measures:
-            lines.append(_measures(bounds))
+            lines.append(_measure_table(bounds))
         lines += bounds.notes
         if bounds.holds:
             lines.append(_verdict(bounds))
@@ -227,12 +239,13 @@ def format_verification(verified: Verification) -> str:
 
 
 def _verdict(bounds: BoundsVerification) -> str:
+    """Return the verdict on bounds of which none is violated; maxima alone hold if RMS errors were not verified."""
     if not any(measure.holds for measure in bounds.measures):
         return "the file declares no errors that could be verified"
     return "the declared errors hold" if bounds.rms_verified else "the declared maxima hold"
 
 
-def _measures(bounds: BoundsVerification) -> str:
+def _measure_table(bounds: BoundsVerification) -> str:
     """Format the verified errors, with measured values if those were measured."""
     if bounds.rms_verified:
         header = ("error", "declared max", "found max", "declared rms", "found rms", "")

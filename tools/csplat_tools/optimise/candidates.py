@@ -253,18 +253,19 @@ class CandidatePool:
         report(stage, 1.0)
         return self.made[-1]
 
-    def with_levels(self, one: Candidate, levels: FittedLevelBuilder) -> Candidate:
+    def with_levels(self, candidate: Candidate, levels: FittedLevelBuilder) -> Candidate:
         """Return the splats of a candidate in a file with levels of detail.
 
         Its tiles differ from the tiles that the splats were refitted for, so its error is larger.
         """
-        coded, entries = one.coded, {"levels": levels.settings(len(one.coded.plan.model))}
+        coded = candidate.coded
+        entries = {"levels": levels.settings(len(coded.plan.model))}
         encoded = levels.encode_plan(coded.plan, coded.codebooks)
         if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
             encoded = replace(encoded, errors=coded.errors)
         error = self.error(self.validation_scorer, encoded.write(entries).data)
-        result = encoded.write({**(one.subset.metadata(psnr_of_mse(error)) or {}), **entries})
-        return replace(one, coded=encoded, result=result, error=error, image_error=None, test_psnr=None)
+        result = encoded.write({**(candidate.subset.metadata(psnr_of_mse(error)) or {}), **entries})
+        return replace(candidate, coded=encoded, result=result, error=error, image_error=None, test_psnr=None)
 
     def error(self, scorer: Scorer, data: bytes) -> float:
         """Return the mean squared error of a file in some views."""

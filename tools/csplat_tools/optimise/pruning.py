@@ -220,8 +220,8 @@ class PrunedSubset:
             before=self.model, background=pruner.views.background, context=pruner.context,
         )  # fmt: skip
         start = fixed.start()
-        before, after = (pruner.check_scorer.psnr(self._decoded(fixed, tried)) for tried in (start, values))
-        values = values if after >= before else start  # a refit of few splats may overfit
+        psnr_start, psnr_refit = (pruner.check_scorer.psnr(self._decoded(fixed, tried)) for tried in (start, values))
+        values = values if psnr_refit >= psnr_start else start  # a refit of few splats may overfit
         # Longer chains overfit, and in surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less).
         if tuned is None and pruner.use_classes:
             self._tuned[kind] = self._with_values(fixed, values)
@@ -239,6 +239,7 @@ class PrunedSubset:
         )  # fmt: skip
 
     def _decoded(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
+        """Return the splats as they decode from these values, in the order of the file."""
         return replace(self.model, **vars(fixed.dequantise(values)), means_double=None)
 
     def metadata(self, validation_psnr: float) -> Mapping[str, Any]:
@@ -247,6 +248,7 @@ class PrunedSubset:
         return {"simplified": {**entry, "validation_psnr": round(validation_psnr, 3)}}
 
     def _weights(self, options: EncodeOptions, *, use_classes: bool) -> NDArray[Any] | Importance | None:
+        """Return the importance for an encoding, without blocks unless it has classes; `None` if no view shows any."""
         if self._importance is None:
             return None
         has_classes = use_classes and max_class_count(len(self.rows), options) > 1
@@ -265,20 +267,27 @@ class PrunedSubset:
             return None
 
 
-def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
-    """Return splats of the source, [N] `rows`, with the values of another refit of [M] `its_rows`; both ascend."""
-    _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
+def _with_values_of(earlier: SplatModel, earlier_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
+    """Return splats with the values of an earlier refit, except means, where that had the splat.
 
-    def carry(own: F32, its: F32) -> F32:
-        own = own.copy()
-        own[here] = its[there]
-        return own
+    Args:
+        earlier: the [M] splats of the earlier refit.
+        earlier_rows: [M], their indices in the source, ascending.
+        start: the [N] splats; those that the earlier refit lacks keep their values.
+        rows: [N], their indices in the source, ascending.
+    """
+    _, there, here = np.intersect1d(earlier_rows, rows, assume_unique=True, return_indices=True)
+
+    def carry_over(values: F32, earlier_values: F32) -> F32:
+        values = values.copy()
+        values[here] = earlier_values[there]
+        return values
 
     return replace(
         start,
-        quats=carry(start.quats, before.quats),
-        scales=carry(start.scales, before.scales),
-        opacities=carry(start.opacities, before.opacities),
-        sh0=carry(start.sh0, before.sh0),
-        shN=carry(start.shN, before.shN),
+        quats=carry_over(start.quats, earlier.quats),
+        scales=carry_over(start.scales, earlier.scales),
+        opacities=carry_over(start.opacities, earlier.opacities),
+        sh0=carry_over(start.sh0, earlier.sh0),
+        shN=carry_over(start.shN, earlier.shN),
     )

@@ -127,8 +127,8 @@ def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: f
         most: largest fraction of the error that pruning may take.
     """
     fits = pruned <= most * allowed
-    rest = np.where(fits, allowed - pruned, 1.0)
-    return np.where(fits, np.log(kept_count) - exponent * np.log(rest), np.inf)
+    quantised = np.where(fits, allowed - pruned, 1.0)  # 1: any positive number, to take its logarithm
+    return np.where(fits, np.log(kept_count) - exponent * np.log(quantised), np.inf)
 
 
 def log_bytes_at_size(relative_count: F64, pruned: F64, quantised: float, exponent: float) -> F64:

@@ -162,7 +162,8 @@ def importance_views(views: ViewSet, splats: int) -> Sequence[Camera]:
     Virtual training views have various distances and directions. Cameras like the test views generalise less. With
     quantisation classes from 40 of them, plane3 has 42 dB on them and 39 on others. From these views, it has 41 and 40.
     """
-    return evenly_spaced(views.training, _VIEWS[views.virtual] // (1 + (splats > MANY_SPLATS)))
+    count = _VIEWS[views.virtual]
+    return evenly_spaced(views.training, count // 2 if splats > MANY_SPLATS else count)
 
 
 def complete_importance(
@@ -187,16 +188,16 @@ def complete_importance(
     Returns:
         The importance, `None` if it is unknown or would change nothing; and the number of views used here.
     """
-    several = max_class_count(len(source), encoding) > 1
+    may_classify = max_class_count(len(source), encoding) > 1
     if isinstance(importance, Importance) and importance.blocks is not None:
-        return (importance if several else None), 0
+        return (importance if may_classify else None), 0
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
-    quick = encoding.preset == "fast" and encoding.max_classes is None
-    if inside or quick or not (several or has_sh):
+    is_fast = encoding.preset == "fast" and encoding.max_classes is None
+    if inside or is_fast or not (may_classify or has_sh):
         return None, 0
-    seen_from = importance_views(views, len(source))
+    cameras = importance_views(views, len(source))
     try:
-        measured = measure_importance(source, seen_from, views.background, context=context)
+        measured = measure_importance(source, cameras, views.background, context=context)
     except InputError:
         return None, 0  # no splat is visible
     if isinstance(importance, Importance):
@@ -205,4 +206,4 @@ def complete_importance(
         measured = replace(measured, sh=np.asarray(importance))
     if not encoding.shape_codebook_size:
         measured = replace(measured, shape_metric=None)  # frees half of the memory
-    return measured, len(seen_from)
+    return measured, len(cameras)

@@ -52,6 +52,7 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
 
 
 def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float]) -> list[str]:
+    """Return a line on the PSNR by kind of other views, compared with `psnr` on test views; no line without any."""
     if not elsewhere:
         return []
     kinds = {"beside": "at other positions"}
@@ -110,26 +111,27 @@ def make_report(
         + len(errors),
         chosen=found.as_json(),
         tried=tuple(candidate.as_json() for candidate in candidates.made),
-        why=(*_why(target, found, candidates, splats_before), *remarks),
+        why=(*_explain_choice(target, found, candidates, splats_before), *remarks),
         sure=sure,
         **numbers,
     )
 
 
-def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_before: int) -> list[str]:
-    """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
+def _explain_choice(target: Target, found: Candidate, candidates: CandidatePool, splats_before: int) -> list[str]:
+    """Return sentences on the coding of SH, the alternatives, a PSNR above the target, and the pruned splats."""
     codings = list(
-        dict.fromkeys(_coding(candidate) for candidate in candidates.made if candidate.subset is found.subset)
+        dict.fromkeys(_describe_coding(candidate) for candidate in candidates.made if candidate.subset is found.subset)
     )
     if found.quality is None:
-        lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]
+        lines = [f"{_describe_coding(found)}, at the precision of the preset {found.options.preset}"]
     else:
-        lines = [f"{_coding(found)}; each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"]
+        attributes = f"each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"
+        lines = [f"{_describe_coding(found)}; {attributes}"]
     if found.class_count > 1:
         lines.append(
             f"splats are sorted into {found.class_count} quantisation classes by importance, each with its own steps"
         )
-    others = [coding for coding in codings if coding != _coding(found)]
+    others = [coding for coding in codings if coding != _describe_coding(found)]
     if others:
         expected = "look worse" if target.size_bytes is not None else "take more"
         lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
@@ -143,7 +145,8 @@ def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_bef
     return lines
 
 
-def _coding(candidate: Candidate) -> str:
+def _describe_coding(candidate: Candidate) -> str:
+    """Describe how a candidate codes SH: bands, and codebook or single values."""
     options = candidate.result.report.options
     if options["sh_coding"] == "none":
         return "no SH bands" if candidate.subset.model.sh_degree else "no SH to code"

@@ -150,17 +150,18 @@ def simplify(
     if target.keep is not None:
         subset = pruner.refit(target.count(len(source)))
     else:
-        subset, scores = _fewest(pruner, target)
-    report = {**_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
+        subset, scores = _prune_to_psnr(pruner, target)
+    report = {**_pruning_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
     report["seconds"] = round(time.perf_counter() - start, 2)
     notes = (_NOT_PRUNED,) if target.keep is None and len(subset.rows) == len(source) else ()
     return Simplified(subset.model, subset.rows, report, notes)
 
 
-def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, float]]:
-    """Return the fewest splats that reach a PSNR on validation views, and their PSNR for the report.
+def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, float]]:
+    """Return the fewest splats that reach a PSNR on validation views, and their PSNR for the report, dB.
 
-    Each number is predicted from the pruning order and the last refits. If none reaches the PSNR, all are kept.
+    For a drop, the PSNR is against images, otherwise against renders of the source. Each number is predicted from the
+    pruning order and the last refit. All splats are kept, without a refit, if none of up to `_TRIES` refits reaches it.
 
     Raises:
         InputError: even the source misses the PSNR.
@@ -174,15 +175,17 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
     assert goal is not None
     if psnr_of_mse(source_error) < goal:
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
-    allowed, refits, last = error_of_psnr(goal), list[tuple[float, PrunedSubset]](), None
-    most = allowed - source_error
+    allowed = error_of_psnr(goal)
+    added_max = allowed - source_error  # largest mean squared error that pruning may add
+    refits = list[tuple[float, PrunedSubset]]()  # with the mean squared error
+    last: tuple[int, float] | None = None  # number of splats of the last refit, and the error that it added
     while True:
-        counts, errors = (values[::-1] for values in pruner.errors(most, last))
+        counts, errors = (values[::-1] for values in pruner.errors(added_max, last))  # np.interp needs ascending counts
         kept_count = next_value(
-            math.log(most),
+            math.log(added_max),
             [(len(subset.rows), math.log(max(error - source_error, NOTHING))) for error, subset in refits],
             partial(np.interp, xp=counts, fp=np.log(np.maximum(errors, NOTHING))), bounds=(counts[0], len(source)),
-            margin=0.5 * AIM * LOG_ERROR_PER_DB, tolerance=AIM * LOG_ERROR_PER_DB * allowed / most, least_step=1.0,
+            margin=0.5 * AIM * LOG_ERROR_PER_DB, tolerance=AIM * LOG_ERROR_PER_DB * allowed / added_max, least_step=1.0,
             tries=_TRIES,
         )  # fmt: skip
         if kept_count is None or math.ceil(kept_count) == len(source):
@@ -197,7 +200,7 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
 
 
 def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:
-    """Return the scores on the test views, for the report; empty without test views."""
+    """Return the PSNR on the test views, dB, and against test images if there are any; empty without test views."""
     views, context = pruner.views, pruner.context
     if not views.test:
         return {}
@@ -211,7 +214,8 @@ def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:
     return scores
 
 
-def _report(pruner: Pruner, subset: PrunedSubset, target: Target) -> dict[str, Any]:
+def _pruning_report(pruner: Pruner, subset: PrunedSubset, target: Target) -> dict[str, Any]:
+    """Return the JSON-compatible report without scores and seconds; each pruned splat has one reason."""
     source, views, order = pruner.source, pruner.sufficient, pruner.order
     pruned = np.ones(len(source), bool)
     pruned[subset.rows] = False

@@ -14,7 +14,7 @@ How a target is met:
    pruning takes too much of the error get no drafts, unless they are the last. For the final number, and for a size,
    drafts of one coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
 5. Files of the best splats and coding are made, with a refit through their quantisers. Each corrects the prediction of
-   the precision, until another file is not expected to save enough (`_finish`). If no file meets the goal, larger
+   the precision, until another file is not expected to save enough (`_make_files`). If no file meets the goal, larger
    subsets of step 4 are taken, then other numbers of splats (fewer for a size). Of all files that meet it, drafts
    included, the smallest is written, or the best file of a size.
 
@@ -169,12 +169,12 @@ class TargetSearch:
         """
         if self.pruner is None:
             coding = self._choose_coding(self.whole, self._most_codings(self.whole))
-            self._finish(self.whole, coding)
+            self._make_files(self.whole, coding)
             if not (coding.use_classes and self.whole.classifiable):  # the presets' own files have no classes
                 self._try_presets(coding)
         else:
             subset, coding, larger = self._choose_splats(self.pruner)
-            while not self._finish(subset, coding):
+            while not self._make_files(subset, coding):
                 if larger:
                     subset, coding = larger.pop()
                     continue
@@ -182,10 +182,10 @@ class TargetSearch:
                 if len(another.model) == len(subset.model):
                     break
                 subset = another
-                self._try(subset, coding, {})
+                self._draft_cost(subset, coding, {})
         met = [candidate for candidate in self.pool.made if self._is_met(candidate)]
         if not met:
-            raise InputError(self._out_of_reach())
+            raise InputError(self._unreached_message())
         return min(met, key=lambda candidate: candidate.size_bytes if self.goal.size_bytes is None else candidate.error)
 
     def best_with_levels(self, levels: FittedLevelBuilder) -> Candidate:
@@ -197,13 +197,15 @@ class TargetSearch:
         Raises:
             InputError: no file meets the goal.
         """
-        goal, made = self.goal, list[tuple[float, Candidate]]()  # with the log of the factor of the goal
-        is_size, near = goal.size_bytes is not None, _WORTH / self._bytes_per_db * self._log_result_per_db
+        goal, is_size = self.goal, self.goal.size_bytes is not None
+        made = list[tuple[float, Candidate]]()  # with the log of the factor of the goal
+        near = _WORTH / self._bytes_per_db * self._log_result_per_db
+        log_level_0 = math.log(_LEVEL_0) if is_size else 0.0  # other levels are expected to add bytes, but no error
         while True:
             log_factor = next_value(
-                0.0, [(before, self._log_result(file)) for before, file in made],
-                lambda before: before - is_size * math.log(_LEVEL_0), bounds=(math.log(_LEAST_LEFT), 0.0),
-                margin=0.5 * near * bool(made), tolerance=near, tries=_ROUNDS,
+                0.0, [(log_tried, self._log_result(file)) for log_tried, file in made],
+                lambda log_tried: log_tried - log_level_0, bounds=(math.log(_LEAST_LEFT), 0.0),
+                margin=0.5 * near if made else 0.0, tolerance=near, tries=_ROUNDS,
             )  # fmt: skip
             if log_factor is None:
                 break
@@ -212,7 +214,7 @@ class TargetSearch:
             size_bytes = None if goal.size_bytes is None else max(1, int(factor * goal.size_bytes))
             without = replace(self, goal=replace(goal, size_bytes=size_bytes, error=error))
             file = self.pool.with_levels(without.best(), levels)
-            self._score(file)
+            self._measure_image_error(file)
             made.append((log_factor, file))
         met = [file for _, file in made if self._is_met(file)]
         if met:
@@ -241,7 +243,7 @@ class TargetSearch:
         candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
         if size_bytes is None:
             if candidate.error > self.goal.error * error_of_psnr(-_BEYOND_REACH):
-                raise InputError(self._out_of_reach())
+                raise InputError(self._unreached_message())
             return None
         return candidate if self._is_met(candidate) else None
 
@@ -250,7 +252,7 @@ class TargetSearch:
         assert self.pruner is not None
         subset, coding, _ = self._choose_splats(self.pruner)
         draft = self.pool.make(subset, coding, self._predict(subset, coding)[0], draft=True)
-        return draft, self._unquantised(subset, coding) + self._quantised(draft)
+        return draft, self._unquantised_error(subset, coding) + self._quantisation_error(draft)
 
     # The number of splats
 
@@ -258,19 +260,21 @@ class TargetSearch:
         """Return the best refitted splats and coding, and the pairs of more splats, most splats first.
 
         The best have the least expected cost, but fewer splats must promise `_WORTH` over more, since their cost is
-        less certain.
+        less certain. The pairs are none for a size. Refits splats, and adds drafts to the pool.
         """
-        kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
-        for left in reversed(range(_ROUNDS)):
+        kept_count = self._first_count(pruner)
+        tried = list[tuple[float, Subset, Coding]]()  # with the expected cost
+        for rounds_left in reversed(range(_ROUNDS)):
             subset = pruner.refit(kept_count)
             usual = self._first_codings(subset)[-1]
-            if left and self.work >= 1.0 and self._took_too_much(subset, usual):
+            if rounds_left and self.work >= 1.0 and self._took_too_much(subset, usual):
                 kept_count = self._next_count(pruner, subset, usual)[0]
                 continue
-            codings = len(self._first_codings(subset)) if self.goal.size_bytes is None else self._most_codings(subset)
-            coding = self._choose_coding(subset, codings)
+            most = len(self._first_codings(subset)) if self.goal.size_bytes is None else self._most_codings(subset)
+            coding = self._choose_coding(subset, most)
             tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
+            # The promised saving has to be worth twice the time of a file.
             if self.work < 1.0 or saved < _WORTH or not self._is_worth(0.5 * saved, subset):
                 break
             if any(abs(len(earlier.model) - kept_count) <= _WORTH * kept_count for _, earlier, _ in tried):
@@ -288,41 +292,47 @@ class TargetSearch:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
         if self.goal.size_bytes is not None:
             return False
-        return self._unquantised(subset, coding) > _TOLERANCE * self._most_left_out * self._allowed
+        return self._unquantised_error(subset, coding) > _TOLERANCE * self._most_left_out * self._allowed
 
     def _first_count(self, pruner: Pruner) -> int:
-        """Return the number of splats to begin with."""
+        """Return the number of splats to begin with, 1 to all. For a PSNR or a drop, extends the pruning order."""
         splats = len(self.whole.model)
         if self.goal.size_bytes is not None:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
-        allowed, known, kept_count = self._allowed, None, splats
-        for left in reversed(range(_ROUNDS)):  # validation views show other pruning errors than training views
+        allowed, kept_count = self._allowed, splats
+        known: tuple[int, float] | None = None
+        for rounds_left in reversed(range(_ROUNDS)):  # validation views show other pruning errors than training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
-            before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
-            if not left or abs(kept_count - before) <= _WORTH * splats:
+            previous_count, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
+            if not rounds_left or abs(kept_count - previous_count) <= _WORTH * splats:
                 break
             pruned = self.whole.model.select(pruner.order.kept(kept_count))
             known = kept_count, error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)
         return kept_count
 
     def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
-        """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
+        """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save.
+
+        The saving is compared with the splats of `subset`, whose measured error corrects the pruning order.
+        """
         size_bytes, allowed, count = self.goal.size_bytes, self._allowed, len(subset.model)
+        # With all bands that the options keep: an error of dropped bands is not one of pruning.
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
-        pruned = self._unquantised(subset, with_bands)
+        pruned = self._unquantised_error(subset, with_bands)
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, (count, pruned))
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, _TOLERANCE * self._most_left_out)
         else:
-            line = self._line(subset, coding)
+            line = self._rate_line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
             counts, errors = pruner.errors(quantised, (count, pruned))
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
         fits = costs if size_bytes is not None else np.where(errors <= self._most_left_out * allowed, costs, np.inf)
         best = int(np.argmin(fits))
-        return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
+        here = np.searchsorted(-counts, -count)  # `counts` descend
+        return self._rounded(counts[best]), float(costs[here] - costs[best])
 
     @property
     def _bytes_per_db(self) -> float:
@@ -362,60 +372,73 @@ class TargetSearch:
     def _choose_coding(self, subset: Subset, most: int) -> Coding:
         """Return the coding with the least expected cost, of at most `most`.
 
-        A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding.
+        A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding, one at a time.
+        Adds drafts to the pool.
         """
         costs = dict[Coding, float]()
         waiting = self._first_codings(subset)
         while waiting and len(costs) < most:
             coding = waiting.pop(0)
-            costs[coding] = self._try(subset, coding, costs)
+            costs[coding] = self._draft_cost(subset, coding, costs)
             if not waiting:
                 ordered = sorted(costs, key=costs.__getitem__)
                 best, books = ordered[0], [book for book in ordered if book.sh == "codebook"]
                 neighbours = self._fewer_bands(subset, best)
                 if books:
-                    neighbours += self._resized(books[0], 2.0)
+                    neighbours += self._resized_codebook(books[0], 2.0)
                     if costs[books[0]] <= costs[best] + _WORTH:  # a smaller codebook hardly gains more
-                        neighbours += self._resized(books[0], 0.5)
+                        neighbours += self._resized_codebook(books[0], 0.5)
                     largest = max(books, key=lambda book: book.entries_per_splat or 0.0)
                     if self._needs_entries(subset, largest, costs[best]):
-                        neighbours += self._resized(largest, 2.0)
-                waiting = [coding for coding in [*neighbours, *self._alike(subset, best)] if coding not in costs][:1]
+                        neighbours += self._resized_codebook(largest, 2.0)
+                waiting = [
+                    coding for coding in [*neighbours, *self._uniform_codings(subset, best)] if coding not in costs
+                ][:1]
         return min(costs, key=costs.__getitem__)
 
-    def _try(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
-        """Make a draft of a coding, more if it is far from its goal and promising, and return the expected cost."""
-        best, quality = min(costs, key=costs.__getitem__, default=None), self._start(subset, coding)
+    def _draft_cost(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
+        """Return the expected cost of a coding in log bytes, from drafts on the goal.
+
+        No draft is made if an earlier one is near the goal, more than one if the first is far and promising. New drafts
+        of the first of all codings are measured against the images of a drop.
+
+        Args:
+            costs: the costs of the codings that were tried before; empty for the first.
+        """
+        best, quality = min(costs, key=costs.__getitem__, default=None), self._first_quality(subset, coding)
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         missed = _MISSED_GAIN if subset.refits and subset.classifiable and not coding.use_classes else 0.0
-        made = self.pool.of(subset, coding, draft=subset.refits)  # when the number of splats was chosen
-        if any(abs(quality - (draft.quality or 0.0)) < _NEAR for draft in made):
+        earlier = self.pool.of(subset, coding, draft=subset.refits)  # when the number of splats was chosen
+        if any(abs(quality - (draft.quality or 0.0)) < _NEAR for draft in earlier):
             return self._predict(subset, coding)[1] + missed
         cost = math.inf
         for _ in range(_ROUNDS):
             draft = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
-                self._score(draft)
+                self._measure_image_error(draft)
             quality, cost = self._predict(subset, coding)
             cost += missed
             if abs(quality - (draft.quality or 0.0)) < _NEAR or (best is not None and cost > costs[best] + _WORTH):
                 break
         return cost
 
-    def _start(self, subset: Subset, coding: Coding) -> float:
-        """Return the precision of the first draft of a subset with a coding, dB."""
+    def _first_quality(self, subset: Subset, coding: Coding) -> float:
+        """Return the precision of the first draft of a subset with a coding, dB.
+
+        It follows from the last candidate of the coding, whose splats may differ; without any, it is that of `_USUAL`.
+        """
         size_bytes = self.goal.size_bytes
         for candidate in reversed(self.pool.made):
             if candidate.coding == coding and candidate.quality is not None:
-                line = self._line(candidate.subset, coding)
+                line = self._rate_line(candidate.subset, coding)
                 if size_bytes is None:
-                    return _clipped(line.quality_at_error(self._rest(subset, coding)))
+                    return _clipped(line.quality_at_error(self._allowed_quantisation(subset, coding)))
                 return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(candidate.subset.model)))
         return _USUAL.quality[coding.sh == "none"]
 
     def _first_codings(self, subset: Subset) -> list[Coding]:
-        """Return a coding of each kind that the caller left open."""
+        """Return a coding of each kind that the caller left open, at least one; a codebook comes last."""
         encoding, degree = self.pool.encoding, self.whole.model.sh_degree
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
@@ -429,7 +452,7 @@ class TargetSearch:
         is_extreme = float(np.abs(self.whole.model.shN).max(initial=0.0)) > _LARGEST_SH
         return [scalar] if is_extreme or encoding.preset == "fast" else [scalar, book]
 
-    def _resized(self, book: Coding, factor: float) -> list[Coding]:
+    def _resized_codebook(self, book: Coding, factor: float) -> list[Coding]:
         """Return a coding with more or fewer codebook entries, or none if their number is given or too large."""
         if book.entries_per_splat is None or self.pool.encoding.codebook_size is not None:
             return []
@@ -446,20 +469,24 @@ class TargetSearch:
         return self.goal.size_bytes is None and math.log(min(draft.size_bytes for draft in drafts)) < cost - _WORTH
 
     def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
-        """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
-        encoding, codings, lower = self.pool.encoding, list[Coding](), self._degree(coding) - 1
-        fixed = encoding.sh_degree is not None or encoding.sh_coding != "auto"
-        if coding.sh == "none" or fixed or self.goal.size_bytes is not None:
+        """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error.
+
+        Return none for a size, and if the caller chose the degree or the coding.
+        """
+        encoding, codings = self.pool.encoding, list[Coding]()
+        is_fixed = encoding.sh_degree is not None or encoding.sh_coding != "auto"
+        if coding.sh == "none" or is_fixed or self.goal.size_bytes is not None:
             return codings
-        while lower >= 0:
-            fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
-            if self._unquantised(subset, fewer) > self._most_left_out * self._allowed:
+        without = Coding("none", degree=0, use_classes=coding.use_classes)
+        for degree in reversed(range(self._degree(coding))):
+            fewer = replace(coding, degree=degree) if degree else without
+            if self._unquantised_error(subset, fewer) > self._most_left_out * self._allowed:
                 break
-            codings, lower = [fewer, *codings], lower - 1
+            codings.insert(0, fewer)
         return codings
 
-    def _alike(self, subset: Subset, coding: Coding) -> list[Coding]:
-        """Return codings with equal steps for all splats in one respect."""
+    def _uniform_codings(self, subset: Subset, coding: Coding) -> list[Coding]:
+        """Return variants of a coding with equal steps for all splats in one more respect, of importance or classes."""
         codings = [replace(coding, adaptive=None)] if coding.adaptive is not None else []
         if subset.classifiable and coding.use_classes:
             codings.append(replace(coding, use_classes=False))
@@ -467,18 +494,21 @@ class TargetSearch:
 
     # The precision
 
-    def _finish(self, subset: Subset, coding: Coding) -> bool:
-        """Make files until the goal is met and another file would hardly be smaller. Return True if it is met."""
+    def _make_files(self, subset: Subset, coding: Coding) -> bool:
+        """Add files to the pool until the goal is met and another would hardly be smaller. Return True if it is met.
+
+        Stop early if other splats or another coding cost less. The pool must have a candidate of the subset and coding.
+        """
         earlier = self.pool.of(subset, coding, draft=False) or self._by_distance(subset, coding, draft=True)[:1]
         for file in earlier:
-            self._score(file)
+            self._measure_image_error(file)
         aim, is_pruned = AIM * self._log_result_per_db, len(subset.model) < len(self.whole.model)
         worth = subset.file_seconds / (100.0 * _SECONDS_PER_PERCENT) / self._bytes_per_db * self._log_result_per_db
         while True:
-            made, line = self.pool.of(subset, coding, draft=False), self._line(subset, coding)
+            made, line = self.pool.of(subset, coding, draft=False), self._rate_line(subset, coding)
             quality = next_value(
                 0.0, [(file.quality or 0.0, self._log_result(file)) for file in made],
-                partial(self._expected, subset, coding, line), bounds=_QUALITIES, margin=aim,
+                partial(self._expected_log_result, subset, coding, line), bounds=_QUALITIES, margin=aim,
                 tolerance=aim + max(aim, worth), largest_step=math.inf if is_pruned else _FAR, least_step=0.5 * APART,
                 tries=len(earlier) + _TRIES,
             )  # fmt: skip
@@ -494,7 +524,7 @@ class TargetSearch:
                 if len(made) > _REFITS or min(map(self._log_result, made)) > _NEAR * LOG_ERROR_PER_DB:
                     return False  # other splats cost less
                 quality = finest + 2.0 * _NEAR  # refits through the quantisers differ by chance
-            self._score(self.pool.make(subset, coding, quality, draft=False))
+            self._measure_image_error(self.pool.make(subset, coding, quality, draft=False))
 
     @property
     def _log_result_per_db(self) -> float:
@@ -509,36 +539,36 @@ class TargetSearch:
         # Against images, the error of a file may equal the source's by chance.
         return math.log(max(error / (self.goal.error - self.goal.source_error), LEAST_QUANTISED))
 
-    def _expected(self, subset: Subset, coding: Coding, line: RateLine, quality: float) -> float:
-        """Return what `_log_result` is expected to be at a precision."""
+    def _expected_log_result(self, subset: Subset, coding: Coding, line: RateLine, quality: float) -> float:
+        """Return what `_log_result` is expected to be for a file at a precision, dB."""
         if self.goal.size_bytes is not None:
             return line.log_bytes_at(quality) - math.log(self.goal.size_bytes)
-        return math.log((self._unquantised(subset, coding) + line.error_at(quality)) / self._allowed)
+        return math.log((self._unquantised_error(subset, coding) + line.error_at(quality)) / self._allowed)
 
     def _predict(self, subset: Subset, coding: Coding) -> tuple[float, float]:
         """Return the precision at which a file of a subset and coding meets the goal, dB, and its cost in log bytes.
 
         For a size, the cost is the log bytes that the file's error is worth.
         """
-        line = self._line(subset, coding)
+        line = self._rate_line(subset, coding)
         if self.goal.size_bytes is not None:
             quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - self._bytes_per_db * AIM)))
         else:
-            quality = line.quality_at_error(self._rest(subset, coding))
+            quality = line.quality_at_error(self._allowed_quantisation(subset, coding))
         return _clipped(quality), self._cost_at(subset, coding, quality)
 
     def _cost_at(self, subset: Subset, coding: Coding, quality: float) -> float:
-        """Return the expected cost in log bytes at a precision."""
-        line = self._line(subset, coding)
+        """Return the expected cost in log bytes at a precision, dB: for a size, what the file's error is worth."""
+        line = self._rate_line(subset, coding)
         if self.goal.size_bytes is None:
             return line.log_bytes_at(quality)
-        return self._exponent * math.log(self._unquantised(subset, coding) + line.error_at(quality))
+        return self._exponent * math.log(self._unquantised_error(subset, coding) + line.error_at(quality))
 
     def _is_worth(self, saved: float, subset: Subset) -> bool:
         """Return True if the fraction of the bytes that another file is expected to save is worth its time."""
         return 100.0 * saved * _SECONDS_PER_PERCENT >= subset.file_seconds
 
-    def _line(self, subset: Subset, coding: Coding) -> RateLine:
+    def _rate_line(self, subset: Subset, coding: Coding) -> RateLine:
         """Return quantisation error and bytes of a subset and coding by precision.
 
         The line passes through the candidate nearest to the goal, a draft only if there is no other. Slopes are
@@ -549,32 +579,38 @@ class TargetSearch:
         for draft in (True, False):
             made = self._by_distance(subset, coding, draft=draft)
             if made:
-                line = RateLine.through([self._point(candidate) for candidate in made], *slopes)
+                line = RateLine.through([self._rate_point(candidate) for candidate in made], *slopes)
                 slopes = line.error_slope, line.bytes_slope
         assert line is not None
         return line
 
-    def _excess(self, one: Candidate) -> float:
+    def _log_excess(self, candidate: Candidate) -> float:
         """Return the log of a candidate's size, or of its quantisation error, divided by the goal's."""
         if self.goal.size_bytes is not None:
-            return math.log(one.size_bytes / self.goal.size_bytes)
-        return math.log(self._point(one).error / self._rest(one.subset, one.coding))
+            return math.log(candidate.size_bytes / self.goal.size_bytes)
+        return math.log(
+            self._rate_point(candidate).error / self._allowed_quantisation(candidate.subset, candidate.coding)
+        )
 
     def _by_distance(self, subset: Subset, coding: Coding, *, draft: bool) -> list[Candidate]:
-        """Return candidates: the nearest to the goal first, then the others on the other side of the goal."""
-        made = [(self._excess(candidate), candidate) for candidate in self.pool.of(subset, coding, draft=draft)]
+        """Return candidates: the nearest to the goal, then those on the other side of the goal, then those on its side.
+
+        Each group ascends by distance; the list is empty without candidates.
+        """
+        made = [(self._log_excess(candidate), candidate) for candidate in self.pool.of(subset, coding, draft=draft)]
         made.sort(key=lambda entry: (abs(entry[0]), -(entry[1].quality or 0.0)))  # of equal distances, the finest first
-        made[1:] = sorted(made[1:], key=lambda entry: (entry[0] > 0.0) == (made[0][0] > 0.0))
-        return [candidate for _, candidate in made]
+        nearest, others = made[:1], made[1:]
+        others.sort(key=lambda entry: (entry[0] > 0.0) == (nearest[0][0] > 0.0))  # stable: by distance on each side
+        return [candidate for _, candidate in nearest + others]
 
-    def _point(self, one: Candidate) -> RatePoint:
+    def _rate_point(self, candidate: Candidate) -> RatePoint:
         """Return precision, bytes and the expected quantisation error of a candidate, after the refit if a draft."""
-        return RatePoint(one.quality or 0.0, self._quantised(one), one.size_bytes)
+        return RatePoint(candidate.quality or 0.0, self._quantisation_error(candidate), candidate.size_bytes)
 
-    def _rest(self, subset: Subset, coding: Coding) -> float:
-        """Return the mean squared error that quantisation may cause."""
+    def _allowed_quantisation(self, subset: Subset, coding: Coding) -> float:
+        """Return the mean squared error that quantisation may cause, above 0 even if pruning takes all of it."""
         allowed = self._allowed * error_of_psnr(AIM)
-        return max(allowed - self._unquantised(subset, coding), LEAST_QUANTISED * allowed)
+        return max(allowed - self._unquantised_error(subset, coding), LEAST_QUANTISED * allowed)
 
     @property
     def _allowed(self) -> float:
@@ -590,13 +626,17 @@ class TargetSearch:
         nearest = min(measured, key=lambda file: abs(self._log_result(file)))
         return nearest.error * math.exp(-self._log_result(nearest))
 
-    def _quantised(self, one: Candidate) -> float:
+    def _quantisation_error(self, candidate: Candidate) -> float:
         """Return the quantisation error of a candidate; for a draft, the error of its file after another refit."""
-        rest = max(one.error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * one.error, NOTHING)
-        return rest * (error_of_psnr(_TUNING_GAIN) if one.is_draft else 1.0)
+        error = max(
+            candidate.error - self._unquantised_error(candidate.subset, candidate.coding),
+            LEAST_QUANTISED * candidate.error,
+            NOTHING,
+        )
+        return error * (error_of_psnr(_TUNING_GAIN) if candidate.is_draft else 1.0)
 
-    def _unquantised(self, subset: Subset, coding: Coding) -> float:
-        """Return the mean squared error before quantisation."""
+    def _unquantised_error(self, subset: Subset, coding: Coding) -> float:
+        """Return the mean squared error before quantisation, of pruning and dropped SH bands; it is measured once."""
         degree = self._degree(coding)
         if not subset.refits and degree == self.whole.model.sh_degree:
             return 0.0
@@ -612,17 +652,18 @@ class TargetSearch:
 
     @staticmethod
     def _error_in(scorer: Scorer, model: SplatModel) -> float:
+        """Return the mean squared error of a model, pooled over the views of a scorer."""
         return scorer.pooled(scorer.errors(model))
 
     # Files on the goal
 
-    def _score(self, file: Candidate) -> None:
-        """Measure a file against the images of a drop."""
+    def _measure_image_error(self, file: Candidate) -> None:
+        """Set `image_error` of a file for a drop, unless it is set; do nothing for another goal."""
         if self.goal.images is not None and file.image_error is None:
             file.image_error = self.pool.error(self.goal.images, file.result.data)
 
     def _is_met(self, file: Candidate) -> bool:
-        """Return True if a file meets the goal and may be written."""
+        """Return True if a file meets the goal and may be written; for a drop, False before `image_error` is set."""
         errors = file.result.report.errors
         if any(errors[name][0] > most for name, most in self.goal.max_error.items() if name in errors):
             return False
@@ -633,13 +674,16 @@ class TargetSearch:
 
     def _try_presets(self, coding: Coding) -> None:
         """Make the presets' own files if their precision is near the goal, so that a search is not worse than these."""
-        wanted, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
+        quality, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
         for name, preset in PRESETS.items():
-            allowed = name == own or "fast" not in (name, own)
-            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < 0.5 * _FAR:
-                self._score(self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False))
+            is_allowed = name == own or "fast" not in (name, own)  # `fast` only as the caller's own, and then alone
+            if is_allowed and abs(preset.quality[coding.sh == "none"] - quality) < 0.5 * _FAR:
+                self._measure_image_error(
+                    self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False)
+                )
 
-    def _out_of_reach(self) -> str:
+    def _unreached_message(self) -> str:
+        """Return the error message if no candidate meets the goal, with the best candidate's size or PSNR."""
         goal, made = self.goal, self.pool.made
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
@@ -693,7 +737,8 @@ def search_target(
     if target.max_psnr_drop is not None and not views.images:
         raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
-    pruner, sensitivity_views = None, 0
+    pruner: Pruner | None = None
+    sensitivity_views = 0
     pool = CandidatePool(encoding, views.validation_scorer(source, context=context), context.progress)
     images = None if target.max_psnr_drop is None else views.image_validation_scorer(context=context)
     goal, whole = Goal.of(target, source, images), WholeScene(source, importance, None, context)
@@ -713,7 +758,7 @@ def search_target(
             whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
         chosen = search.best() if levels is None else search.best_with_levels(levels)
-    remarks = [_INSIDE_REMARK] * (inside and chosen.splats < len(source))
+    remarks = [_INSIDE_REMARK] if inside and chosen.splats < len(source) else []
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
     report = make_report(
@@ -758,16 +803,16 @@ def _is_empty(scorer: Scorer) -> bool:
     return all(np.ptp(image, axis=(0, 1)).max() == 0.0 for image in images)
 
 
-def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
-    """Return the PSNR on views that were not used in the search, by kind."""
-    model, groups = decode(found.result.data), extra_test_cameras(source).items()
+def _psnr_elsewhere(source: SplatModel, chosen: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
+    """Return the PSNR on views that were not used in the search, dB to three decimals, by kind."""
+    model, groups = decode(chosen.result.data), extra_test_cameras(source).items()
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, context=context).psnr(model), 3)
         for kind, cameras in groups
     }
 
 
-def _image_psnr(source: SplatModel, found: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
+def _image_psnr(source: SplatModel, chosen: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
     """Return the PSNR of file and source against the test images, dB."""
     scorer = views.image_test_scorer(context=context)
-    return {"file": scorer.psnr(decode(found.result.data)), "source": scorer.psnr(source)}
+    return {"file": scorer.psnr(decode(chosen.result.data)), "source": scorer.psnr(source)}

@@ -127,7 +127,7 @@ def render_folder(
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _remove_if_empty(target if is_new else None):
-        renders = _renders(model, cameras, background, mode, backend, prepare, context)
+        renders = _render_each(model, cameras, background, mode, backend, prepare, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
@@ -173,7 +173,7 @@ def render_film(
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
-    for result in _renders(model, cameras, background, mode, backend, prepare, context):
+    for result in _render_each(model, cameras, background, mode, backend, prepare, context):
         ignored = max(ignored, result.ignored)
         frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
@@ -195,7 +195,7 @@ def on_backend(model: SplatModel, backend: Backend) -> SplatModel | Renderable:
     return model if device is None else GpuScene(device, [model])
 
 
-def _renders(
+def _render_each(
     model: SplatModel,
     cameras: Sequence[Camera],
     background: Colour | None,
@@ -204,11 +204,12 @@ def _renders(
     prepare: Callable[[], object] | None,
     context: Context,
 ) -> Iterator[Render]:
+    """Yield the render of each camera, with arguments as for `render_folder`. Calls `prepare` and reports progress."""
     if prepare is not None:
         prepare()
     record = model.metadata.training
-    behind = background or (record.background if record else BLACK)
-    draw = renderer(on_backend(model, backend), behind, mode=mode, context=context)
+    colour = background or (record.background if record else BLACK)
+    draw = renderer(on_backend(model, backend), colour, mode=mode, context=context)
     for number, camera in enumerate(cameras):
         context.progress("rendering", number / len(cameras))
         yield draw(camera)

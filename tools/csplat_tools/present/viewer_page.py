@@ -184,17 +184,19 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
     open_paths: list[str] = []
 
     def visit(path: str) -> int:
+        """Add a module after its imports, unless it was added before; return its number."""
         assert path not in open_paths, f"modules import each other: {' -> '.join([*open_paths, path])}"
         if path not in numbers:
             assert path in texts, f"{open_paths[-1] if open_paths else 'the page'} imports {path}, which does not exist"
             open_paths.append(path)
-            text = _IMPORT.sub(lambda match: taken(path, match), texts[path])
+            text = _IMPORT.sub(lambda match: replace_import(path, match), texts[path])
             open_paths.pop()
             numbers[path] = len(functions)
             functions[path] = _as_function(path, text)
         return numbers[path]
 
-    def taken(path: str, match: re.Match[str]) -> str:
+    def replace_import(path: str, match: re.Match[str]) -> str:
+        """Return a statement that takes the names of an import from a linked module, which is added first."""
         target = f"link({visit(posixpath.normpath(posixpath.join(posixpath.dirname(path), match['name'])))});"
         names = match["all"] or re.sub(r"\s+as\s+", ": ", match["some"] or "")
         return f"const {names} = {target}" if names else target
@@ -233,12 +235,12 @@ def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
 
 
 def _as_function(path: str, text: str) -> str:
-    """Return a module with replaced imports as a function that returns its exports."""
+    """Return the text of a module whose imports are replaced as a function of `link` that returns its exports."""
     names = [match["name"] for match in _DECLARED.finditer(text)]
     names += [re.sub(r"([\w$]+)\s+as\s+([\w$]+)", r"\2: \1", match["names"]) for match in _LISTED.finditer(text)]
     text = _LISTED.sub("", _DECLARED.sub("", text))
-    left = _STATEMENT.search(text)
-    assert left is None, f"{path} has a statement that cannot be linked: {left[0] if left else ''}"
+    statement = _STATEMENT.search(text)
+    assert statement is None, f"{path} has a statement that cannot be linked: {statement[0] if statement else ''}"
     text = text.replace(_START_WORKER, "link.startWorker()")
     text = text.replace("import.meta.url", "document.baseURI")  # the module is part of the page
     return f"// {path}\n(link) => {{\n{text}return {{ {', '.join(names)} }};\n}},\n"
@@ -259,5 +261,6 @@ def _policy(style: str, script: str) -> str:
 
 
 def _replace_once(text: str, old: str, new: str) -> str:
+    """Return the text with `old`, which must be in it exactly once, replaced by `new`."""
     assert text.count(old) == 1, f"the page has {old!r} once"
     return text.replace(old, new)

@@ -111,6 +111,17 @@ class SceneServer(ThreadingHTTPServer):
     daemon_threads = True  # connections that a browser keeps open must not keep the command alive
 
     def __init__(self, host: str, port: int, resources: Mapping[str, _Resource], start: str) -> None:
+        """Bind and listen, and set `url`.
+
+        Args:
+            host: address of a network interface, or a name of this machine; IPv4 is preferred.
+            port: port number; 0 for any free port.
+            resources: content by path, without the first slash.
+            start: path of the page with its query, to which `/` redirects.
+
+        Raises:
+            OSError, OverflowError, ValueError: the host or the port cannot be used.
+        """
         self.resources = resources
         self.start = start
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -185,12 +196,14 @@ def open_server(
     if not host.strip():  # would be all interfaces
         raise InputError("the host is empty, expected 127.0.0.1 for local access, 0.0.0.0 for all interfaces")
     place = f"scene/{scene.name}"
-    resources = {path: _file(file) for path, file in web_files().items()}
+    resources = {path: _file_resource(file) for path, file in web_files().items()}
     content = scene.content
-    resources[place] = _bytes(content, ".csplat") if isinstance(content, bytes) else _file(content, ".csplat")
+    resources[place] = (
+        _bytes_resource(content, ".csplat") if isinstance(content, bytes) else _file_resource(content, ".csplat")
+    )
     parameters = {"scene": "/" + quote(place), **(wishes or {})}
     if "camera" in parameters:  # too long for a URL
-        resources["cameras.json"] = _bytes(parameters["camera"].encode(), ".json")
+        resources["cameras.json"] = _bytes_resource(parameters["camera"].encode(), ".json")
         parameters["camera"] = "/cameras.json"
     start = f"/{PAGE}?{urlencode(parameters)}"
     try:
@@ -200,7 +213,7 @@ def open_server(
     except ValueError:  # not a valid host name: 300 letters, for example
         raise InputError(_NOT_HERE.format(host)) from None
     except OSError as error:
-        raise InputError(_refusal(error, host, port)) from None
+        raise InputError(_bind_error_message(error, host, port)) from None
     with server:
         yield server
 
@@ -229,13 +242,13 @@ def page_parameters(
     if overrides.coordinate_system is not None:
         wishes["axes"] = overrides.coordinate_system
     if overrides.up is not None:
-        wishes["up"] = _join(overrides.up)
+        wishes["up"] = _format_direction(overrides.up)
     return wishes
 
 
 def estimated_up_parameters(up: Direction | None) -> dict[str, str]:
     """Return the parameters of the page for an estimated up direction, which has the lowest priority."""
-    return {} if up is None else {"seems": _join(up)}
+    return {} if up is None else {"seems": _format_direction(up)}
 
 
 def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
@@ -276,6 +289,7 @@ def _position(digits: str) -> int:
 
 
 def _is_address(host: str) -> bool:
+    """Return True for an IPv4 or IPv6 address without brackets."""
     try:
         ip_address(host)
     except ValueError:
@@ -289,24 +303,30 @@ def _is_loopback(address: str) -> bool:
     return (getattr(parsed, "ipv4_mapped", None) or parsed).is_loopback
 
 
-def _join(up: Direction) -> str:
+def _format_direction(up: Direction) -> str:
     return ",".join(f"{value:g}" for value in up)
 
 
 def _check_scene(path: Path, stem: str) -> ViewerScene:
+    """Return the scene of a .csplat file, of which only header and size are checked.
+
+    Raises:
+        FormatError: the header is invalid, or the file has another size than it declares.
+    """
     with mapped_csplat(str(path)) as data:
         header, size = read_header(data), len(data)
     if size != header.file_size:
-        code, at, clause, detail = (
+        code, offset, clause, detail = (
             (ERROR_TRUNCATED, size, "HDR-5", "the file ends early")
             if size < header.file_size
             else (ERROR_TRAILING, header.file_size, "HDR-6", "bytes follow the end of the file")
         )
-        raise FormatError(code, at, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
-    return ViewerScene(f"{stem}.csplat", path, size, header, _seems_up(path, header))
+        raise FormatError(code, offset, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
+    return ViewerScene(f"{stem}.csplat", path, size, header, _estimate_file_up(path, header))
 
 
-def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
+def _estimate_file_up(path: Path, header: SceneHeader) -> Direction | None:
+    """Return the estimated up direction; `None` if the scene has axes, too many splats, or does not decode."""
     if header.splat_count > _UP_SPLATS_MAX or header.coordinate_system != UNSPECIFIED:
         return None
     try:
@@ -316,6 +336,11 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
 
 
 def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -> ViewerScene:
+    """Read a scene of another format, and encode it in memory under the name `stem`.
+
+    Raises:
+        CsplatError: the scene is not valid.
+    """
     source = read_source(str(path), progress=context.progress)
     data = encode(source.model(), EncodeOptions(preset=preset), context=context)
     header, up = read_header(data), estimate_up(source.model())
@@ -331,10 +356,10 @@ class _Handler(BaseHTTPRequestHandler):
     raw_requestline: bytes
 
     def do_GET(self) -> None:
-        self._answer(send=True)
+        self._respond(send=True)
 
     def do_HEAD(self) -> None:
-        self._answer(send=False)
+        self._respond(send=False)
 
     def parse_request(self) -> bool:
         """Parse a request; refuse HTTP/0.9, which has no version and no headers."""
@@ -366,7 +391,12 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: standard error is for messages to the user."""
 
-    def _answer(self, *, send: bool) -> None:
+    def _respond(self, *, send: bool) -> None:
+        """Answer a request: a resource, a redirect from `/` to the page, or status 400, 404 or 421.
+
+        Args:
+            send: send the body, too; False for HEAD.
+        """
         server = self.server
         assert isinstance(server, SceneServer)
         if self.headers.get("Content-Length", "0").strip() != "0" or "Transfer-Encoding" in self.headers:
@@ -388,7 +418,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         path = unquote(target.path).removeprefix("/")
         if path == "":
-            self._start(HTTPStatus.FOUND, {"Location": server.start, "Content-Length": "0"})
+            self._write_head(HTTPStatus.FOUND, {"Location": server.start, "Content-Length": "0"})
             return
         resource = server.resources.get(path)
         if resource is None:
@@ -400,27 +430,29 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, send=send)
             return
         with stream:
-            self._send(resource, stream, size, send=send)
+            self._send_resource(resource, stream, size, send=send)
 
-    def _send(self, resource: _Resource, stream: BinaryIO, size: int, *, send: bool) -> None:
+    def _send_resource(self, resource: _Resource, stream: BinaryIO, size: int, *, send: bool) -> None:
+        """Send an open resource of `size` bytes, the requested range of it, or status 416 if that has no byte."""
         tag = resource.tag(stream)
         headers = {"Content-Type": resource.media_type, "Accept-Ranges": "bytes", "ETag": tag}
-        condition = self.headers.get("If-Range")
+        condition = self.headers.get("If-Range")  # the tag of the version of which the client has a part
         try:
             requested = byte_range(self.headers.get("Range"), size) if condition in (None, tag) else None
         except ValueError:
             headers |= {"Content-Range": f"bytes */{size}", "Content-Length": "0"}
-            self._start(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers)
+            self._write_head(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers)
             return
         first, length = requested or (0, size)
         headers["Content-Length"] = str(length)
         if requested is not None:
             headers["Content-Range"] = f"bytes {first}-{first + length - 1}/{size}"
-        self._start(HTTPStatus.OK if requested is None else HTTPStatus.PARTIAL_CONTENT, headers)
+        self._write_head(HTTPStatus.OK if requested is None else HTTPStatus.PARTIAL_CONTENT, headers)
         if send:
-            self._copy(stream, first, length)
+            self._write_range(stream, first, length)
 
-    def _copy(self, stream: BinaryIO, first: int, length: int) -> None:
+    def _write_range(self, stream: BinaryIO, first: int, length: int) -> None:
+        """Write `length` bytes of a stream from `first` on; if it ends before, mark the connection to be closed."""
         stream.seek(first)
         while length > 0:
             block = stream.read(min(length, _BLOCK_BYTES))
@@ -431,12 +463,14 @@ class _Handler(BaseHTTPRequestHandler):
             length -= len(block)
 
     def _refuse(self, status: HTTPStatus, *, send: bool) -> None:
+        """Answer with an error status, and its phrase as text if `send`."""
         body = f"{status.value} {status.phrase}\n".encode()
-        self._start(status, {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+        self._write_head(status, {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
         if send:
             self.wfile.write(body)
 
-    def _start(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
+    def _write_head(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
+        """Write the status line and the headers; `headers` replace those of `_HEADERS`."""
         self.send_response(status)
         if self.close_connection:
             self.send_header("Connection", "close")
@@ -445,7 +479,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
 
-def _file(path: Path, ending: str = "") -> _Resource:
+def _file_resource(path: Path, ending: str = "") -> _Resource:
+    """Return the resource of a file, opened anew for each request; `ending` replaces its own for the media type."""
+
     def open_file() -> tuple[BinaryIO, int]:
         stream = open_binary(path)
         return stream, os.fstat(stream.fileno()).st_size
@@ -457,7 +493,8 @@ def _file(path: Path, ending: str = "") -> _Resource:
     return _Resource(open_file, _TYPES[ending or path.suffix], tag)
 
 
-def _bytes(data: bytes, ending: str) -> _Resource:
+def _bytes_resource(data: bytes, ending: str) -> _Resource:
+    """Return the resource of bytes in memory, with the media type of a file name ending."""
     tag = f'"{zlib.crc32(data):08x}"'
     return _Resource(lambda: (io.BytesIO(data), len(data)), _TYPES[ending], lambda _stream: tag)
 
@@ -465,7 +502,8 @@ def _bytes(data: bytes, ending: str) -> _Resource:
 _NOT_HERE = "{} is not an address of this machine: use 127.0.0.1 for local access, 0.0.0.0 for all interfaces"
 
 
-def _refusal(error: OSError, host: str, port: int) -> str:
+def _bind_error_message(error: OSError, host: str, port: int) -> str:
+    """Return the message for an error of binding to a host and port, with a remedy if one is known."""
     if error.errno == errno.EADDRINUSE:
         return f"port {port} is in use: --port 0 finds a free port"
     if error.errno == errno.EACCES:

@@ -204,7 +204,11 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
 def _train(
     data_set: DataSet, options: TrainOptions, files: Outputs, *, plot: str | None, context: Context, quiet: bool
 ) -> TrainResult:
-    """Read the images, train, plot the loss, and print a summary."""
+    """Read the images, train, plot the loss to the path `plot` if given, and print a summary unless `quiet`.
+
+    Raises:
+        InputError: an image is damaged, or an option cannot be used.
+    """
     for line in () if quiet else data_set.report:
         note(line)
     data_set.read()  # before kernels are compiled, to find damaged images early
@@ -216,7 +220,7 @@ def _train(
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data_set.name).name)
     if not quiet:
-        note(_summary(result.log, result.metrics))
+        note(_summarise_training(result.log, result.metrics))
     return result
 
 
@@ -245,7 +249,8 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
         raise InputError(f"{files.previews} is not a folder")
 
 
-def _summary(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
+def _summarise_training(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
+    """Return a line on a training: splats, steps, seconds, and scores on test images if there are any."""
     text = f"{counted(log['splat_count'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
     if metrics is None:
         return text + "; no test images"

@@ -264,17 +264,18 @@ def make_training_page(
     """
     sizes = {} if file is None else {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}
     parts = [
-        _scores(training, file),
-        _images(shown),
-        _training_plot(training),
-        _tuning_plot(file),
+        _score_section(training, file),
+        _image_section(shown),
+        _training_section(training),
+        _tuning_section(file),
         html.section("Bytes by attribute", html.attribute_figure(sizes)) if sizes else "",
-        html.section("Options", html.definitions(_options(training, file))),
+        html.section("Options", html.definitions(_option_texts(training, file))),
     ]
-    return html.document(title, parts, _summary(training, file))
+    return html.document(title, parts, _summarise(training, file))
 
 
-def _summary(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+def _summarise(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    """Return a line on the result: splats, size of the file, and minutes of training and tuning without scoring."""
     words = []
     if file is not None:
         words += [counted(file["splats"], "splat"), format_bytes(file["size_bytes"])]
@@ -284,35 +285,41 @@ def _summary(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None)
     seconds = training["seconds"] if training else 0.0
     if file is not None:
         tuning = file["seconds"]["tuning"]
-        seconds += file["seconds_without_judging"] - tuning + max(tuning, file["log"]["seconds"])  # if it was resumed
+        # A resumed tuning took longer than this run: the log has the time of all runs.
+        seconds += file["seconds_without_judging"] - tuning + max(tuning, file["log"]["seconds"])
     return "; ".join([*words, f"{seconds / 60:.1f} minutes"])
 
 
-def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+def _score_section(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    """Return the section on the scores of the file, or else of the trained scene; empty without scores."""
     if file is not None and file["scores"]:
-        scores, views, by = file["scores"], file["test_view_count"], file["test_reference"]
+        scores, view_count, reference = file["scores"], file["test_view_count"], file["test_reference"]
     elif training is not None and training["metrics"]:
-        scores, views, by = {"trained scene": training["metrics"]}, training["metrics"]["views"], _TEST_IMAGES
+        scores, view_count = {"trained scene": training["metrics"]}, training["metrics"]["views"]
+        reference = _TEST_IMAGES
     else:
         return ""
     text = (
-        f"Measured on {views} {_reference_text(by)}, which had no part in the training. psnr is pooled over all pixels,"
-        " dB; psnr_mean is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
+        f"Measured on {view_count} {_reference_text(reference)}, which had no part in the training. psnr is pooled over"
+        " all pixels, dB; psnr_mean is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
     )
     return html.section("Scores", html.paragraph(text), html.table(("", *SCORES), score_rows(scores)))
 
 
 def _reference_text(reference: str) -> str:
+    """Return the words for the references of the test views."""
     return "held-out images" if reference == _TEST_IMAGES else reference
 
 
-def _images(shown: Sequence[ShownView]) -> str:
+def _image_section(shown: Sequence[ShownView]) -> str:
+    """Return the section with images of test views; empty without any."""
     blocks = [f"<h3>{escape(view.name)}</h3>\n{html.image_row(view.images, view.name)}" for view in shown]
     text = "Test views, evenly spread. Images are compressed for this page."
     return html.section("Renders", html.paragraph(text), *blocks) if blocks else ""
 
 
-def _training_plot(training: Mapping[str, Any] | None) -> str:
+def _training_section(training: Mapping[str, Any] | None) -> str:
+    """Return the section with the plot of a training; empty if its log has fewer than two entries."""
     if training is None or len(training["entries"]) < 2:
         return ""
     entries, evaluations = training["entries"], training["evaluations"]
@@ -334,12 +341,13 @@ def _training_plot(training: Mapping[str, Any] | None) -> str:
         count_axes.set_ylim(bottom=0)
         count_axes.grid(visible=False)
 
-    small = training["options"]["half_size"]
-    note = html.paragraph(f"The first {small:.0%} of the steps used images of half the size.") if small else ""
+    half_size = training["options"]["half_size"]  # fraction of the steps
+    note = html.paragraph(f"The first {half_size:.0%} of the steps used images of half the size.") if half_size else ""
     return html.section("Training", note, html.figure(draw_svg(draw, (_WIDE, _HIGH), "training")))
 
 
-def _tuning_plot(file: Mapping[str, Any] | None) -> str:
+def _tuning_section(file: Mapping[str, Any] | None) -> str:
+    """Return the section with the plot of a tuning; empty if its log has fewer than two validations."""
     validations = [] if file is None else file["log"]["validations"]
     if len(validations) < 2:
         return ""
@@ -360,18 +368,20 @@ def _tuning_plot(file: Mapping[str, Any] | None) -> str:
     return html.section("Tuning", html.paragraph(text), plot)
 
 
-def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> dict[str, str]:
+def _option_texts(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> dict[str, str]:
+    """Return options of training, encoding and tuning, seconds by stage, and peak memory as text, by title."""
     words = {}
     if training is not None:
-        words["training"] = _join(training["options"])
+        words["training"] = _format_options(training["options"])
     if file is not None:
-        words |= {"encoding": _join(file["encoding"]), "tuning": _join(file["log"]["options"])}
-        words["seconds"] = _join(file["seconds"])
+        words |= {"encoding": _format_options(file["encoding"]), "tuning": _format_options(file["log"]["options"])}
+        words["seconds"] = _format_options(file["seconds"])
     memory = (file["log"] if file else training or {}).get("peak_memory_bytes")
     if memory is not None:
         words["peak memory"] = format_bytes(memory)
     return words
 
 
-def _join(options: Mapping[str, Any]) -> str:
+def _format_options(options: Mapping[str, Any]) -> str:
+    """Format options as `name value, name value`, without `None`, lists and mappings."""
     return ", ".join(f"{name} {value}" for name, value in options.items() if isinstance(value, str | int | float))

@@ -277,15 +277,16 @@ class Tuner:
 
     def _pruner(self, options: SimplifyOptions) -> Pruner:
         """Return a pruner of the splats to choose from. Without validation views, some training views serve as such."""
-        views = with_validation_views(replace(self.views, training=self._measuring, test=()))
+        views = with_validation_views(replace(self.views, training=self._measuring_views, test=()))
         return options.pruner(self.source.select(self.rows), views, use_classes=False, context=self.context)
 
     @property
     def _pruning_options(self) -> SimplifyOptions:
+        """The options of pruning for the effort."""
         return SimplifyOptions(effort=self.effort)
 
     @property
-    def _measuring(self) -> Sequence[Camera]:
+    def _measuring_views(self) -> Sequence[Camera]:
         """The views in which importance is measured, and to whose renders kept splats are fitted."""
         return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
 
@@ -310,7 +311,7 @@ class Tuner:
         is_pruned: bool = True,
         weights: NDArray[Any] | Importance | None = None,
     ) -> TunedSubset:
-        """Tune a file.
+        """Tune a file, and add the times of its stages to the timer. Only the first file resumes from a checkpoint.
 
         Args:
             model: its splats.
@@ -338,21 +339,30 @@ class Tuner:
 
     def _importance_of(self, model: SplatModel, rows: I64) -> NDArray[Any] | Importance:
         """Return the importance of some splats; `rows`, [N] int64, are their indices in the source."""
-        given = self.importance
-        if given is not None:
-            return given.select(rows) if isinstance(given, Importance) else given[rows]
-        return measure_importance(model, self._measuring, self._background, self.options.device, context=self.context)
+        known = self.importance
+        if known is not None:
+            return known.select(rows) if isinstance(known, Importance) else known[rows]
+        return measure_importance(
+            model, self._measuring_views, self._background, self.options.device, context=self.context
+        )
 
     @property
     def _background(self) -> F32:
+        """[3], the background colour of the views."""
         return np.array(self.views.background, np.float32)
 
     def _precise(self, model: SplatModel, weights: NDArray[Any] | Importance, size_bytes: int) -> EncodeOptions:
-        """Return the options with the precision at which the untuned file has about the size.
+        """Return the options with the precision at which the untuned file has about a size, and a coding of SH.
 
-        The search uses a sample, whose splats take more bytes for centres, and fewer for indices of its smaller
-        codebooks. How much all splats take is learnt without importance and shapes, which cost most of the time: of
-        130,000 splats of Lego, 0.94 of the sample's bytes per splat instead of 0.92.
+        Options that have a precision are returned unchanged. The search uses a sample, whose splats take more bytes
+        for centres, and fewer for indices of its smaller codebooks. How much all splats take is learnt without
+        importance and shapes, which cost most of the time: of 130,000 splats of Lego, 0.94 of the sample's bytes per
+        splat instead of 0.92.
+
+        Args:
+            model: the splats of the file.
+            weights: their importance.
+            size_bytes: the size. If even the least precision needs more, that is returned.
         """
         if self.encoding.attribute_psnr is not None:
             return self.encoding
@@ -363,12 +373,14 @@ class Tuner:
         silent = replace(self.context, progress=null_progress)
 
         def encoded_bytes(
-            splats: SplatModel, its_weights: NDArray[Any] | Importance | None, options: EncodeOptions
+            splats: SplatModel, splat_weights: NDArray[Any] | Importance | None, options: EncodeOptions
         ) -> int:
-            plan = EncodePlan.of(splats, options, importance=its_weights, allow_classes=False, context=silent)
+            """Return the size of an untuned file of these splats."""
+            plan = EncodePlan.of(splats, options, importance=splat_weights, allow_classes=False, context=silent)
             return len(encode_tiles(plan).write().data)
 
-        def search(most: float) -> float:
+        def search_quality(most: float) -> float:
+            """Return the precision of the sample's largest file of at most `most` bytes, dB; extends `measured`."""
             while True:
                 quality = next_value(
                     math.log(most), measured, _LOG_BYTES_PER_DB, bounds=_PRECISIONS, margin=0.5 * _PRECISE,
@@ -385,11 +397,14 @@ class Tuner:
         codings = [replace(middle, sh_coding=coding) for coding in _SH_CODINGS] if is_open else [middle]
         sizes = [encoded_bytes(sample, sample_weights, coding) for coding in codings]
         options, size = min(zip(codings, sizes, strict=True), key=operator.itemgetter(1))
-        measured = [(sum(_PRECISIONS) / 2.0, math.log(size))]
-        quality = search(size_bytes * count / len(model))
+        measured = [(sum(_PRECISIONS) / 2.0, math.log(size))]  # precision and log bytes of files of the sample
+        quality = search_quality(size_bytes * count / len(model))
         if count < len(model):
             plain = replace(options, attribute_psnr=quality, shape_codebook_size=0)
-            quality = search(size_bytes * encoded_bytes(sample, None, plain) / encoded_bytes(model, None, plain))
+            # The size of the sample's file when the file of all splats has `size_bytes`.
+            quality = search_quality(
+                size_bytes * encoded_bytes(sample, None, plain) / encoded_bytes(model, None, plain)
+            )
         return replace(options, attribute_psnr=quality)
 
     def tune_to_size(self, size_bytes: int) -> TunedSubset:
@@ -406,12 +421,13 @@ class Tuner:
             while len(rows) > kept_count:
                 model = self.source.select(rows)
                 errors = measure_pruning(
-                    model, self._measuring, self._background, self.options.device, context=self.context
+                    model, self._measuring_views, self._background, self.options.device, context=self.context
                 )
                 rows = rows[kept_in_round(model.opacities, errors, kept_count)]
             model = self.source.select(rows)
             weights = self._importance_of(model, rows)
-        goal, made = math.log(size_bytes), list[tuple[float, TunedSubset]]()  # with the log of the untuned size
+        goal = math.log(size_bytes)
+        made = list[tuple[float, TunedSubset]]()  # with the log of the untuned size
         while True:
             untuned = next_value(
                 goal, [(value, math.log(subset.final_bytes)) for value, subset in made], lambda value: value - _WORTH,
@@ -422,7 +438,7 @@ class Tuner:
             with self._timer.stage("choosing"):
                 encoding = self._precise(model, weights, round(math.exp(untuned)))
             made.append((untuned, self._tune(model, rows, encoding, size_bytes, weights=weights)))
-        return max(_fitting([subset for _, subset in made], size_bytes), key=lambda subset: subset.psnr)
+        return max(_files_within([subset for _, subset in made], size_bytes), key=lambda subset: subset.psnr)
 
     def tune_to(self, target: Target) -> TunedSubset:
         """Tune the best file of a size, or the smallest file of a PSNR on the validation views.
@@ -445,10 +461,15 @@ class Tuner:
             whole = WholeScene(pruner.source, None, None, replace(self.context, progress=null_progress))
             missed = 0.0 if target.psnr is None else self._image_error(pruner.source)
         # Values are sizes or errors of drafts; results are those of the tuned files.
-        is_size, goal = target.size_bytes is not None, float(target.size_bytes or error_of_psnr(target.psnr or 0.0))
-        made, drafts, measured, value = list[TunedSubset](), list[Candidate](), list[tuple[float, float]](), goal
+        is_size = target.size_bytes is not None
+        goal = value = float(target.size_bytes or error_of_psnr(target.psnr or 0.0))
+        made, drafts = list[TunedSubset](), list[Candidate]()
+        measured = list[tuple[float, float]]()
         while True:
-            margin, tolerance = (_WORTH * bool(made), 1.0) if is_size else (_AIM, _TOLERANCE)
+            if is_size:
+                margin, tolerance = _WORTH if made else 0.0, 1.0  # any file of at most the size ends the search
+            else:
+                margin, tolerance = _AIM, _TOLERANCE
             proposed = next_value(
                 goal, measured, lambda value: value + missed, bounds=(_FINER * value, goal if is_size else 1.0),
                 margin=margin * goal, tolerance=tolerance * goal, tries=_TUNINGS,
@@ -456,9 +477,9 @@ class Tuner:
             if proposed is None:
                 break
             value = proposed
-            wanted = Goal(round(value)) if is_size else Goal(error=value)
+            draft_goal = Goal(round(value)) if is_size else Goal(error=value)
             with self._timer.stage("choosing"):
-                draft, expected = TargetSearch(wanted, pool, whole, pruner, options.work).best_draft()
+                draft, expected = TargetSearch(draft_goal, pool, whole, pruner, options.work).best_draft()
             if draft in drafts:
                 break
             drafts.append(draft)
@@ -469,7 +490,7 @@ class Tuner:
             result = made[-1].size_bytes if is_size else error_of_psnr(made[-1].psnr)
             measured.append((value if is_size else expected, result))
         if target.psnr is None:
-            return _fitting(made, target.size_bytes or 0)[0]
+            return _files_within(made, target.size_bytes or 0)[0]
         reached = [subset for subset in made if subset.psnr >= target.psnr]
         if reached:
             return min(reached, key=lambda subset: subset.size_bytes)
@@ -485,11 +506,11 @@ class Tuner:
         return scorer.pooled(scorer.errors(model))
 
 
-def _fitting(made: Sequence[TunedSubset], size_bytes: int) -> list[TunedSubset]:
-    """Return the files of at most a size.
+def _files_within(made: Sequence[TunedSubset], size_bytes: int) -> list[TunedSubset]:
+    """Return the files of at most a size, at least one, in the given order.
 
     Raises:
-        InputError: there are none.
+        InputError: all files are larger.
     """
     fitting = [subset for subset in made if subset.size_bytes <= size_bytes]
     if not fitting:
@@ -547,11 +568,16 @@ def choose_and_finetune(
 
 
 def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:
+    """Return the importance in a file, [N] if it is an array, of the source's N splats; `None` without a file.
+
+    Raises:
+        InputError: the file is invalid, or belongs to another scene.
+    """
     if importance is None:
         return None
-    given = read_importance(importance, source)
-    if isinstance(given, StoredSensitivity):
-        return given.importance()
-    if isinstance(given, np.ndarray) and given.shape != (len(source),):
-        raise InputError(f"{importance} has shape {given.shape}, expected ({len(source)},)")
-    return given
+    content = read_importance(importance, source)
+    if isinstance(content, StoredSensitivity):
+        return content.importance()
+    if isinstance(content, np.ndarray) and content.shape != (len(source),):
+        raise InputError(f"{importance} has shape {content.shape}, expected ({len(source)},)")
+    return content

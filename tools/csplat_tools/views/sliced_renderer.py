@@ -90,6 +90,7 @@ class SlicedScene:
 
     @property
     def _fixed_bytes(self) -> int:
+        """Memory besides that of a slice, bytes."""
         return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.record.itemsize
 
     def renderer(
@@ -121,17 +122,19 @@ class _SlicedRender:
     def drawn(self) -> RenderResult:
         """Draw all slices, and return the render."""
         limits = self._limits(map(_source, Scene.of(self._scene.sample).blocks()), 1, self._scene.every)
-        self._draw(_source(self._scene.scene.empty()))  # the background, in case no splat is visible
+        self._draw_slice(_source(self._scene.scene.empty()))  # the background, in case no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
         self._report(1.0)
         assert self._last is not None
         return replace(self._last, drawn=self._done, intersections=self._pairs, ignored=self._ignored)
 
     @property
-    def _full(self) -> float:
+    def _planned_bytes(self) -> float:
+        """Memory that a planned slice may take, bytes; less than the limit, since plans use samples."""
         return _FULL * self._scene.room_bytes
 
     def _report(self, share: float) -> None:
+        """Report the fraction of the render that is done."""
         self._progress(STAGE, share)
 
     def _visible_splats(self, splats: HasSplats) -> tuple[F32, F64, int]:
@@ -148,7 +151,9 @@ class _SlicedRender:
     def _sort_and_draw(
         self, blocks: Callable[[], Iterator[Source]], count: int, limits: F32, *, first: bool = False
     ) -> None:
-        """Sort splats into slices, and draw them; slices that are too large are cut again.
+        """Sort splats into slices on disk, and draw them from near to far; slices that are too large are cut again.
+
+        Stops when no pixel lets more light through. The first pass sets the counts of ignored and visible splats.
 
         Args:
             blocks: the splats, in order.
@@ -169,14 +174,14 @@ class _SlicedRender:
                     self._ignored, self._visible = self._ignored + ignored, self._visible + len(rows)
             spool.flush()
             for key, number in spool.counts().items():
-                if not (self._state[..., 0] > 0.0).any():
+                if not (self._state[..., 0] > 0.0).any():  # transmittance
                     return
                 read = partial(spool.sources, key)
                 if sizes[key] <= self._scene.room_bytes or number == 1:
-                    self._draw(next(read(number)))
+                    self._draw_slice(next(read(number)))
                 elif 0 < key < len(limits) and np.nextafter(limits[key - 1], np.float32(np.inf)) == limits[key]:
-                    for part in read(max(1, int(number * self._full / sizes[key]))):  # equal depths: in order
-                        self._draw(part)
+                    for part in read(max(1, int(number * self._planned_bytes / sizes[key]))):  # equal depths: in order
+                        self._draw_slice(part)
                 else:
                     every = -(-number // _SAMPLED)
                     self._sort_and_draw(
@@ -189,9 +194,10 @@ class _SlicedRender:
         if not sampled:
             return np.empty(0, np.float32)
         near, taken = (np.concatenate(columns) for columns in zip(*sampled, strict=True))
-        return slice_limits(near, taken, max(least, math.ceil(taken.sum() * share / self._full)))
+        return slice_limits(near, taken, max(least, math.ceil(taken.sum() * share / self._planned_bytes)))
 
-    def _draw(self, splats: HasSplats) -> None:
+    def _draw_slice(self, splats: HasSplats) -> None:
+        """Draw splats behind those drawn before; sets the last render, and adds up drawn splats and pairs."""
         render = self._rasteriser.forward(
             splats, self._camera, background=self._background, state=self._state,
             antialiased=self._scene.scene.metadata.antialiased,
@@ -218,8 +224,8 @@ def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
         return np.empty(0, np.float32)
     rows = rows[np.argsort(near[rows], kind="stable")]
     sums = np.cumsum(taken[rows])
-    at = np.searchsorted(sums, sums[-1] * np.arange(1, pieces) / pieces)
-    values, counts = np.unique(near[rows[np.minimum(at, len(rows) - 1)]], return_counts=True)
+    cuts = np.searchsorted(sums, sums[-1] * np.arange(1, pieces) / pieces)
+    values, counts = np.unique(near[rows[np.minimum(cuts, len(rows) - 1)]], return_counts=True)
     alone = values[(counts > 1) | (values == near[rows[0]])]
     limits: F32 = np.unique(np.concatenate([values, np.nextafter(alone, np.float32(np.inf))]))
     return limits

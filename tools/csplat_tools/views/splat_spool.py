@@ -93,13 +93,13 @@ class SplatSpool:
         Raises:
             OSError: the file cannot be read.
         """
-        left, size = self.counts().get(key, 0), self.dtype.itemsize
-        block, filled = np.empty(min(most, left), self.dtype), 0
-        for at, count in self._parts.get(key, ()):
+        splat_count, size = self.counts().get(key, 0), self.dtype.itemsize
+        block, filled = np.empty(min(most, splat_count), self.dtype), 0  # the first `filled` records were read
+        for offset, count in self._parts.get(key, ()):
             done = 0
             while done < count:
                 step = min(count - done, len(block) - filled)
-                _read_at(self.stream, at + done * size, block[filled : filled + step].view(np.uint8).data)
+                _read_at(self.stream, offset + done * size, block[filled : filled + step].view(np.uint8).data)
                 done, filled = done + step, filled + step
                 if filled == len(block):
                     yield _unpack(block)
@@ -109,17 +109,22 @@ class SplatSpool:
 
 
 def _unpack(records: RecordArray) -> Source:
+    """Return a copy of records as splats to draw."""
     arrays: dict[str, Any] = {name: np.ascontiguousarray(records[name]) for name in _ARRAYS}
     return Source(**arrays)
 
 
-def _read_at(stream: IO[bytes], at: int, buffer: memoryview) -> None:
-    """Fill a buffer from an offset of the file, without moving the file position."""
+def _read_at(stream: IO[bytes], offset: int, buffer: memoryview) -> None:
+    """Fill a buffer from an offset of the file, without moving the file position.
+
+    Raises:
+        OSError: the file cannot be read, or ends before.
+    """
     while buffer:
-        count = read_into(stream.fileno(), buffer, at)
+        count = read_into(stream.fileno(), buffer, offset)
         if not count:
             raise OSError(errno.EIO, "the file of sorted splats has become shorter")
-        buffer, at = buffer[count:], at + count
+        buffer, offset = buffer[count:], offset + count
 
 
 def open_spool(dtype: np.dtype[Any], count: int) -> SplatSpool:

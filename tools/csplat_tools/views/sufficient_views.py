@@ -70,6 +70,7 @@ def find_sufficient_views(
     """
 
     def measure(cameras: Sequence[Camera]) -> MeasuredViews:
+        """Measure pruning errors in views, and keep their renders."""
         return MeasuredViews.of(model, cameras, views.background, keep_renders=True, context=context)
 
     if not views.training or not views.validation:
@@ -100,7 +101,10 @@ def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
 
 def _gap(model: SplatModel, used: PruningError, check: PruningError) -> float:
-    """Return by how many dB the predicted error of the splats to prune is larger in held-out views."""
+    """Return by how many dB the predicted error of the splats to prune is larger in held-out views than in used views.
+
+    It is per value of a render, and 0 if either error is 0.
+    """
     keys = pruning_keys(model.opacities, used)
     order = np.argsort(keys, kind="stable")[: int(_PRUNED * len(model))]
     order = order[np.isfinite(keys[order])]

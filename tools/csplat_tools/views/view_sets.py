@@ -58,6 +58,7 @@ _TEST_EVERY, _TEST_MAX = 4, 24  # every Nth camera of a file is a test view, up 
 _VALIDATION_EVERY = 8  # every Nth view that is not a test view is a validation view
 _VALIDATION_MAX = 16  # validation images of a data set, at most
 _VALIDATION_SEED = 1000  # seed of virtual validation views, added to the user's
+_POSE_DIGITS = 9  # decimals of pose and field of view by which views are told apart
 _HOLD_OUT_EVERY = 8  # every Nth image is a test image by default
 
 _TIMED_MAX = 2  # timed renders, at most
@@ -101,6 +102,11 @@ class ViewSet:
     split: Split = "test"
 
     def __post_init__(self) -> None:
+        """Refuse views of one pose in several roles.
+
+        Raises:
+            InputError: a view has two roles.
+        """
         seen: dict[bytes, str] = {}
         for role in ("training", "validation", "test"):
             for camera in getattr(self, role):
@@ -174,6 +180,11 @@ class ViewSet:
             _ = image.pixels, image.mask
 
     def _image_scorer(self, cameras: Sequence[Camera], mode: Mode, context: Context) -> Scorer:
+        """Return the scorer on some views, against their images.
+
+        Raises:
+            InputError: the views have no images.
+        """
         from csplat_trainer.posed_images import image_scorer
 
         if not self.images:
@@ -190,7 +201,8 @@ def describe_views(count: int, name: str) -> str:
 def pose_key(camera: Camera) -> bytes:
     """Return bytes that identify a view at any image size: its pose and its field of view."""
     lens = camera.K[:2] / np.array([[camera.W], [camera.H]])
-    return (np.round(np.concatenate([camera.viewmat[:3].ravel(), lens.ravel()]), 9) + 0.0).tobytes()
+    values = np.round(np.concatenate([camera.viewmat[:3].ravel(), lens.ravel()]), _POSE_DIGITS)
+    return (values + 0.0).tobytes()  # -0.0 becomes 0.0, which has other bytes
 
 
 @dataclass(frozen=True)
@@ -352,23 +364,39 @@ def _views_of_file(
     virtual: tuple[int, tuple[int, int], int],
     validation_count: int | None,
 ) -> ViewSet:
+    """Return views of a camera file, in which each pose counts once.
+
+    With `_SPLIT_FROM` or more cameras, the file is split into all three roles. With fewer, all are test views, and the
+    others are virtual.
+
+    Args:
+        source: the scene.
+        path: the camera file.
+        background: background colour; `None`: as in the scene's metadata, or black.
+        virtual: number, size (width and height) and seed of virtual training views.
+        validation_count: number of validation views; `None`: as usual.
+
+    Raises:
+        InputError: the file is invalid, or no view would be left for training.
+    """
     report: list[str] = []
-    given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
+    # Of cameras with one pose, the last is kept, at the place of the first.
+    cameras = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
     record = source.metadata.training
     colour, notes = _choose_background(background, record)
-    few = len(given) < _SPLIT_FROM
-    if few:
-        test_poses = {pose_key(camera) for camera in given}
-        test = given
+    is_virtual = len(cameras) < _SPLIT_FROM
+    if is_virtual:
+        test_poses = {pose_key(camera) for camera in cameras}
+        test = cameras
         training, validation = (
             _without(test_poses, part) for part in _place_virtual(source, *virtual, validation_count)
         )
     else:
-        every = range(0, len(given), _TEST_EVERY)
-        test, rest = _split(given, evenly_spaced(every, _TEST_MAX))
-        validation, training = _split_validation(rest, validation_count)
+        test_places = evenly_spaced(range(0, len(cameras), _TEST_EVERY), _TEST_MAX)
+        test, others = _split_at(cameras, test_places)
+        validation, training = _split_validation(others, validation_count)
     return ViewSet(
-        _set_name(path), colour, training, validation, test, virtual=few, origin=source.origin,
+        _view_set_name(path), colour, training, validation, test, virtual=is_virtual, origin=source.origin,
         notes=(*report, *notes),
     )  # fmt: skip
 
@@ -380,27 +408,46 @@ def _views_of_data(
     validation_count: int | None,
     split: Split,
 ) -> ViewSet:
+    """Return the views of a data set, with cameras relative to the scene's origin.
+
+    Validation views are the set's own, evenly spaced, or are taken from its training images if it has none or
+    `validation_count` is given. Training views with the pose of a test view
+    are dropped, and validation views with the pose of either.
+
+    Args:
+        source: the scene.
+        data: the data set, or how to open it.
+        background: background colour; `None`: as in the scene's metadata, or black.
+        validation_count: number of validation views; `None`: as usual.
+        split: `train` scores on the training images, instead of training on them.
+
+    Raises:
+        InputError: the data set is invalid, or no view would be left for training.
+    """
     record = source.metadata.training
     name, data_set, notes = (
         _open_data_set(data, record) if isinstance(data, DataOptions) else (data.name, data, list[str]())
     )
     shift = np.subtract(source.origin, data_set.origin)
     parts = (data_set.train, data_set.test, evenly_spaced(data_set.val, _VALIDATION_MAX))
-    train, test, val = (_shift(part, shift) for part in parts)
-    colour, more = _choose_background(background, record, images=True)
+    train, test, val = (_shift_origin(part, shift) for part in parts)
+    colour, colour_notes = _choose_background(background, record, images=True)
     if split == "train":
         train, test, val = [], train, []
+    pose_notes = list[str]()
     test_poses = {pose_key(image.camera) for image in test}
     training = _without(test_poses, [image.camera for image in train])
     if len(training) < len(train):
-        more.append(f"{len(train) - len(training)} training images are dropped: they have the pose of a test view")
+        pose_notes.append(
+            f"{len(train) - len(training)} training images are dropped: they have the pose of a test view"
+        )
     taken = test_poses | {pose_key(camera) for camera in training}
     validation = _without(taken, [image.camera for image in val])
     if validation_count or not validation:
         validation, training = _split_validation(training, validation_count)
     return ViewSet(
         name, colour, training, validation, [image.camera for image in test], [*train, *val, *test],
-        origin=source.origin, notes=(*data_set.report, *notes, *more), split=split,
+        origin=source.origin, notes=(*data_set.report, *notes, *colour_notes, *pose_notes), split=split,
     )  # fmt: skip
 
 
@@ -409,19 +456,19 @@ def _open_data_set(data: DataOptions, record: TrainingRecord | None) -> tuple[st
     require_data_sets()
     from csplat_trainer.data.loader import find_image_folder, load
 
-    named = data.path
-    folder, images = find_image_folder(named)
+    user_path = data.path
+    folder, images = find_image_folder(user_path)
     if images is not None:
         data = replace(data, path=str(folder), images=images)
     options, notes = _complete_options(data, record)
     every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
     if images is not None:  # the user named the folder of images, which may therefore be a link to anywhere
-        options = replace(options, path=named, images=None)
+        options = replace(options, path=user_path, images=None)
     data_set = load(
         options.path, options.size, images=options.images, test_every=every, near=options.near,
         trust_paths=options.trust_paths,
     )  # fmt: skip
-    return _set_name(data.path), data_set, notes
+    return _view_set_name(data.path), data_set, notes
 
 
 def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple[DataOptions, list[str]]:
@@ -429,17 +476,20 @@ def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple
     values: dict[str, Any] = {}
     notes = []
     for name in (field.name for field in fields(data) if field.name != "path"):
-        asked, known = getattr(data, name), getattr(record, name, None)
-        values[name] = known if asked is None else asked
-        if None not in (asked, known) and asked != known:
-            notes.append(f"{name} is {asked}, but the scene was trained with {known}")
+        option, recorded = getattr(data, name), getattr(record, name, None)
+        values[name] = recorded if option is None else option
+        if option is not None and recorded is not None and option != recorded:
+            notes.append(f"{name} is {option}, but the scene was trained with {recorded}")
     return replace(data, **values), notes
 
 
 def _choose_background(
     background: Colour | None, record: TrainingRecord | None, *, images: bool = False
 ) -> tuple[Colour, list[str]]:
-    """Return the background colour, and remarks; with `images`, also if it is unknown."""
+    """Return the background colour: the user's, that of the training, or black, and remarks.
+
+    A remark points out a colour that is not the training's and, with `images`, that the training's is unknown.
+    """
     if background is not None:
         if record is None or record.background == background:
             return background, []
@@ -450,24 +500,29 @@ def _choose_background(
     return BLACK, ["the training background is unknown: black is used, set --background to change it"] if images else []
 
 
-def _set_name(path: str) -> str:
+def _view_set_name(path: str) -> str:
     """Return the name of a file or folder, changed if it equals the name of virtual views."""
     name = resolve_links(path).name
     return f"./{name}" if name == VIRTUAL else name
 
 
 def _colour_name(colour: Colour) -> str:
+    """Format a colour as `black`, `white` or `0.5,0.5,0.5`."""
     return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
 
 
-def _shift(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
+def _shift_origin(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
+    """Return the images with cameras relative to a new origin, [3], in coordinates of the old one."""
     return [replace(image, camera=relative_to(shift, image.camera)) for image in images]
 
 
 def _place_virtual(
     source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
 ) -> tuple[list[Camera], list[Camera]]:
-    """Return virtual training views, and validation views like the views of `psnr` at other positions."""
+    """Return virtual training views, and validation views like the views of `psnr` at other positions.
+
+    Training views are `count` and `HELD_OUT_COUNT` more, of `size` (width and height). None are returned for count 0.
+    """
     if count < 1:
         return [], []
     usual, width, height = virtual_views.VIRTUAL_SIZES.validation
@@ -477,7 +532,16 @@ def _place_virtual(
 
 
 def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -> tuple[list[Camera], list[Camera]]:
-    """Split cameras into validation views, evenly spread, and training views of other poses."""
+    """Split cameras into validation views, evenly spread, and training views of other poses.
+
+    Args:
+        cameras: the cameras.
+        validation_count: number of validation views; `None`: one of `_VALIDATION_EVERY` cameras, but at least one of
+            two, and none of a single camera.
+
+    Raises:
+        InputError: `validation_count` is above 0, and not less than the number of cameras.
+    """
     count = len(cameras)
     if validation_count is None:
         every = min(_VALIDATION_EVERY, count)
@@ -485,12 +549,14 @@ def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -
     elif validation_count and validation_count >= count:
         raise InputError(f"validation_count is {validation_count}, which leaves none of {count} views for training")
     else:
+        # The middles of equal parts.
         places = [(2 * number + 1) * count // (2 * validation_count) for number in range(validation_count)]
-    validation, others = _split(cameras, places)
+    validation, others = _split_at(cameras, places)
     return validation, _without({pose_key(camera) for camera in validation}, others)
 
 
-def _split(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
+def _split_at(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
+    """Return the cameras at some places, in ascending order, and the others."""
     chosen = set(places)
     return [cameras[i] for i in sorted(chosen)], [camera for i, camera in enumerate(cameras) if i not in chosen]
 

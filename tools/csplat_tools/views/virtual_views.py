@@ -108,8 +108,8 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     inwards = np.arange(len(cameras)) % _OUTWARDS != 0
     best = np.where(inwards, details[inwards].max(), details[~inwards].max())
     good = np.flatnonzero(details >= _GOOD_DETAIL * best)
-    rest = np.setdiff1d(np.argsort(-details, kind="stable"), good, assume_unique=True)
-    return [cameras[i] for i in [*good, *rest][:count]]
+    others = np.setdiff1d(np.argsort(-details, kind="stable"), good, assume_unique=True)  # most detail first
+    return [cameras[i] for i in [*good, *others][:count]]
 
 
 def cameras_outside(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
@@ -121,7 +121,7 @@ def cameras_outside(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     cameras = []
     for point in _sequence(count, seed):
         along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(2.0 * point[1] - 1.0)))
-        eye = centre + radius * _between(_OUTSIDE_DISTANCE, point[2]) * along
+        eye = centre + radius * _interpolate(_OUTSIDE_DISTANCE, point[2]) * along
         cameras.append(look_at(eye, centre, frame.up, K, *size, frame.near))
     return cameras
 
@@ -148,26 +148,35 @@ def _sequence(count: int, seed: int) -> F64:
     return np.concatenate([even, rng.random((count, 3))], axis=1)
 
 
-def _between(bounds: tuple[float, float], at: float) -> float:
-    return bounds[0] + (bounds[1] - bounds[0]) * at
+def _interpolate(bounds: tuple[float, float], fraction: float) -> float:
+    """Return the number at a fraction of the way from the first bound to the second."""
+    return bounds[0] + (bounds[1] - bounds[0]) * fraction
 
 
 def _around_object(frame: SceneFrame, point: F64, K: F64, size: tuple[int, int]) -> Camera:
-    height = _between(_OBJECT_HEIGHT, point[1])
+    """Return the camera of a point of `_sequence` that looks at a place near the centre of an object from outside.
+
+    Coordinates 0 to 2 determine azimuth, height and distance, the others the place. `size` is width and height.
+    """
+    height = _interpolate(_OBJECT_HEIGHT, point[1])
     along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(height)))
-    eye = frame.centre + frame.extent * _between(_OBJECT_DISTANCE, point[2]) * along
+    eye = frame.centre + frame.extent * _interpolate(_OBJECT_DISTANCE, point[2]) * along
     target = frame.centre + frame.extent * _OBJECT_OFFSET * (2.0 * point[3:] - 1.0)
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
 def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: tuple[int, int]) -> Camera:
-    along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(_between(_AROUND_HEIGHT, point[1]))))
+    """Return the camera of a point of `_sequence` inside of surroundings, with arguments as for `_around_object`.
+
+    Every `_OUTWARDS`th by its number looks outwards from near the centre, the others inwards at a place near it.
+    """
+    along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(_interpolate(_AROUND_HEIGHT, point[1]))))
     offset = _AROUND_OFFSET * (2.0 * point[3:] - 1.0)
     if number % _OUTWARDS == 0:
         eye = frame.centre + frame.extent * offset
         target = eye + along
     else:
-        eye = frame.centre + frame.extent * _between(_AROUND_DISTANCE, point[2]) * along
+        eye = frame.centre + frame.extent * _interpolate(_AROUND_DISTANCE, point[2]) * along
         target = frame.centre + frame.extent * offset
     return look_at(eye, target, frame.up, K, *size, frame.near)
 

@@ -37,6 +37,9 @@ _PASSES = {
 _HARDWARE = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU")
 _KINDS = (*_HARDWARE, "CPU", "Unknown")  # preferred kinds first
 
+_BINDING_MAX = 1 << 30  # bytes; larger buffers are not used even if the GPU allows them
+_ALIGNMENT = 16  # bytes; buffers are multiples of a vector of four numbers, and not empty
+
 
 @dataclass(frozen=True)
 class Adapter:
@@ -89,17 +92,17 @@ class Device:
     def __init__(self, wgpu: Any, adapter: Any, binding_max: int | None) -> None:
         self.adapter = _describe(adapter)
         limits = adapter.limits
-        wanted = {}
+        required = {}
         if binding_max is None:
             names = ("max-buffer-size", "max-storage-buffer-binding-size")
-            wanted = {name: limits[name] for name in names}
+            required = {name: limits[name] for name in names}
         self._wgpu = wgpu
         self.has_timestamps = _TIMESTAMPS in adapter.features
         features = [_TIMESTAMPS] if self.has_timestamps else []
         with self._named_errors():
-            self._device = adapter.request_device_sync(required_limits=wanted, required_features=features)
+            self._device = adapter.request_device_sync(required_limits=required, required_features=features)
         largest = min(self._device.limits[name] for name in ("max-buffer-size", "max-storage-buffer-binding-size"))
-        self.binding_max = min(binding_max or largest, largest, 1 << 30)
+        self.binding_max = min(binding_max or largest, largest, _BINDING_MAX)
         self._pipelines: dict[tuple[str, str], Any] = {}
 
     def buffer(self, size_bytes: int, *, uniform: bool = False, indirect: bool = False) -> Any:
@@ -110,7 +113,7 @@ class Device:
         """
         usage = self._wgpu.BufferUsage
         flags = usage.COPY_DST | usage.COPY_SRC | (usage.UNIFORM if uniform else usage.STORAGE)
-        size = max(16, -(-size_bytes // 16) * 16)
+        size = max(_ALIGNMENT, -(-size_bytes // _ALIGNMENT) * _ALIGNMENT)
         with self._named_errors():
             return self._device.create_buffer(size=size, usage=flags | (usage.INDIRECT if indirect else 0))
 
@@ -149,7 +152,7 @@ class Device:
         """
         with self._named_errors():
             encoder = self._encoder(clear)
-            _encode(encoder.begin_compute_pass(), calls)
+            _encode_calls(encoder.begin_compute_pass(), calls)
             self._device.queue.submit([encoder.finish()])
 
     def time(self, stages: Sequence[Stage], *, clear: Sequence[Any] = ()) -> list[float]:
@@ -173,7 +176,7 @@ class Device:
                     "beginning_of_pass_write_index": 2 * number,
                     "end_of_pass_write_index": 2 * number + 1,
                 }
-                _encode(encoder.begin_compute_pass(timestamp_writes=writes), calls)
+                _encode_calls(encoder.begin_compute_pass(timestamp_writes=writes), calls)
             usage = self._wgpu.BufferUsage
             stamps = self._device.create_buffer(size=8 * count, usage=usage.QUERY_RESOLVE | usage.COPY_SRC)
             encoder.resolve_query_set(queries, 0, count, stamps, 0)
@@ -183,7 +186,7 @@ class Device:
         return [float(end - begin) * unit * 1e-6 for begin, end in times]
 
     def _encoder(self, clear: Sequence[Any]) -> Any:
-        """Return an encoder of commands, which sets the buffers `clear` to 0 first."""
+        """Return a new encoder of commands, whose first commands set the buffers `clear` to 0."""
         encoder = self._device.create_command_encoder()
         for buffer in clear:
             encoder.clear_buffer(buffer)
@@ -213,18 +216,21 @@ class Device:
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
-        """Raise errors of wgpu within the context as an `InputError` with the GPU's name."""
+        """Raise errors of wgpu within the context as an `InputError` with the GPU's name.
+
+        After any error but a lack of memory, `open_device` opens all GPUs anew.
+        """
         try:
             yield
         except self._wgpu.GPUOutOfMemoryError:
             raise InputError(f"{self.adapter} has too little memory") from None
         except (self._wgpu.GPUError, RuntimeError) as error:  # wgpu raises the latter if a buffer cannot be read
-            open_device.cache_clear()  # the next call opens the GPU again
+            open_device.cache_clear()  # the device may be lost
             last = str(error).strip().rpartition("\n")[2].strip()
             raise InputError(f"{self.adapter} failed: {last or type(error).__name__}") from None
 
     def _pipeline(self, name: str, entry: str) -> Any:
-        """Return the pipeline of an entry point of a pass, which is compiled once."""
+        """Return the pipeline of an entry point of a pass, see `shader_source`; it is compiled once per device."""
         pipeline = self._pipelines.get((name, entry))
         if pipeline is None:
             module = self._device.create_shader_module(label=name, code=shader_source(name))
@@ -235,8 +241,8 @@ class Device:
         return pipeline
 
 
-def _encode(compute: Any, calls: Sequence[Call]) -> None:
-    """Add calls to a compute pass, and end it."""
+def _encode_calls(compute: Any, calls: Sequence[Call]) -> None:
+    """Add calls to a compute pass in their order, and end it; nothing runs before it is submitted."""
     for call in calls:
         compute.set_pipeline(call.pipeline)
         compute.set_bind_group(0, call.group)
@@ -249,7 +255,7 @@ def _encode(compute: Any, calls: Sequence[Call]) -> None:
     compute.end()
 
 
-_UPLOAD = 1 << 26  # bytes per write
+_UPLOAD = 1 << 26  # bytes per write of `Device.upload`
 _TIMESTAMPS = "timestamp-query"
 
 
@@ -305,6 +311,7 @@ def open_device(*, software: bool = False, binding_max: int | None = None) -> De
 
 
 def _describe(adapter: Any) -> Adapter:
+    """Return the description of wgpu's adapter; its kind is `Unknown` if this module does not know it."""
     info = adapter.info
     kind = info["adapter_type"]
     return Adapter(info["device"], kind if kind in _KINDS else _KINDS[-1], info["backend_type"])

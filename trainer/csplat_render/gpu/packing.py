@@ -38,8 +38,10 @@ MODEL_TILE = 1 << 14
 _INTEGER_BITS = 23  # integers up to this, and their sums with offsets of the same size, are exact in binary32
 _MEAN_BITS = 24  # exact in binary32; more are rounded to it
 _PATTERN = 32  # bits
+_WORD_BITS, _WORD_MASK = 32, 0xFFFFFFFF
 _BAND_ROWS, _BAND_CODEBOOK = 1, 2
-_SQUARED, _ANTIALIASED = 1 << 24, 1 << 25
+_SQUARED, _ANTIALIASED = 1 << 24, 1 << 25  # flags above the number of splats
+_BELOW_DEGREE = 0xFFFFFF  # bits of the word of widths below the SH degree
 
 
 @dataclass(eq=False)
@@ -128,11 +130,11 @@ def pack_tile(tile: PackedTile, tables: SharedTables, shift: F64, *, antialiased
     quats = (tile.quats + tile.quat_levels).T
     flags = (_SQUARED if tile.opacities_squared else 0) | (_ANTIALIASED if antialiased else 0)
     writer = _TileWriter(len(tile.opacities))
-    writer.put(means, mean_bits)
-    writer.put(tile.opacities[None], [opacity_bits])
-    writer.put(scales, [scale_bits] * 3)
-    writer.put(quats, [quat_bits] * 3)
-    writer.put(sh0, [sh0_bits] * 3)
+    writer.put_fields(means, mean_bits)
+    writer.put_fields(tile.opacities[None], [opacity_bits])
+    writer.put_fields(scales, [scale_bits] * 3)
+    writer.put_fields(quats, [quat_bits] * 3)
+    writer.put_fields(sh0, [sh0_bits] * 3)
     writer.set_constants(
         flags, mean_bits, opacity_bits, scale_bits, quat_bits, sh0_bits, tile.opacity_levels, tile.quat_levels
     )
@@ -164,7 +166,7 @@ def pack_splats(splats: UncheckedSplats, part: slice, shift: F64, *, antialiased
     quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1.0), (1.0, 0.0, 0.0, 0.0))
     writer = _TileWriter(len(means))
     for fields in (offsets, np.where(valid, opacities, 0.0)[:, None], scales, quats, sh0):
-        writer.put(_patterns(fields).T, [_PATTERN] * fields.shape[1])
+        writer.put_fields(_patterns(fields).T, [_PATTERN] * fields.shape[1])
     writer.set_constants(
         _ANTIALIASED if antialiased else 0, [_PATTERN] * 3, _PATTERN, _PATTERN, _PATTERN, _PATTERN, 1, 1
     )
@@ -176,7 +178,7 @@ def pack_splats(splats: UncheckedSplats, part: slice, shift: F64, *, antialiased
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of coefficients: words, bits per field, offset and step."""
+    """Packed rows of SH coefficients. A coefficient is (field + offset) · step, or for 32 bits the field's pattern."""
 
     words: Words
     bits: int
@@ -185,30 +187,39 @@ class _Rows:
 
 
 class _TileWriter:
-    """The words and constants of a tile."""
+    """The words and constants of a tile.
+
+    All fields of the geometry come first (`put_fields`), then `set_constants` and, for integers, `set_lattices`, then
+    the bands, whose offsets depend on the number of words of the geometry.
+    """
 
     def __init__(self, splats: int) -> None:
         self._splats = splats
         self._blocks = -(-splats // BLOCK)
-        self._planes: list[Words] = []
-        self._bit = 0
-        self._rest: list[Words] = []
+        self._planes: list[Words] = []  # one word of every splat each, padded to whole blocks
+        self._bit = 0  # number of bits of a splat so far
+        self._band_words: list[Words] = []  # what follows the geometry
         self._indices: dict[int, int] = {}  # first word, by id of the array
         self._constants = np.zeros((TILE_ROWS, 4), np.uint32)
 
-    def put(self, columns: NDArray[Any], bits: list[int]) -> None:
-        """Append a field per column [C, n] to every splat."""
+    def put_fields(self, columns: NDArray[Any], bits: list[int]) -> None:
+        """Append fields to the bits of every splat; a field may continue in the next word.
+
+        Args:
+            columns: [C, n] unsigned integers, one field of each splat per row.
+            bits: [C], their widths, at most 32.
+        """
         for column, width in zip(columns, bits, strict=True):
             values = np.zeros(self._blocks * BLOCK, np.uint64)
             values[: self._splats] = column
-            word, shift = self._bit >> 5, self._bit & 31
+            word, shift = divmod(self._bit, _WORD_BITS)
             self._bit += width
-            while len(self._planes) < -(-self._bit // 32):
+            while len(self._planes) < -(-self._bit // _WORD_BITS):
                 self._planes.append(np.zeros(self._blocks * BLOCK, np.uint32))
             values <<= np.uint64(shift)
-            self._planes[word] |= (values & np.uint64(0xFFFFFFFF)).astype(np.uint32)
-            if shift + width > 32:
-                self._planes[word + 1] |= (values >> np.uint64(32)).astype(np.uint32)
+            self._planes[word] |= (values & np.uint64(_WORD_MASK)).astype(np.uint32)
+            if shift + width > _WORD_BITS:
+                self._planes[word + 1] |= (values >> np.uint64(_WORD_BITS)).astype(np.uint32)
 
     def set_constants(
         self,
@@ -232,7 +243,7 @@ class _TileWriter:
         )
 
     def set_lattices(self, scales: F64, sh0: F64) -> None:
-        """Set the offsets of the three columns, and the step, of scales and sh0."""
+        """Set the lattices of scales and sh0, [4] each: the offsets of the three columns, and the step."""
         self._constants[2] = np.asarray(scales, np.float32).view(np.uint32)
         self._constants[3] = np.asarray(sh0, np.float32).view(np.uint32)
 
@@ -253,36 +264,49 @@ class _TileWriter:
         self._constants[3 + 2 * band, 3] = size
 
     def put_rows(self, band: int, rows: _Rows) -> None:
+        """Append a band that has a row of coefficients for each splat, in their order."""
         head = (_BAND_ROWS | rows.bits << 16, 0, 0, self._append(rows.words))
         self._set_band(band, head, (0.0, rows.offset, rows.step))
 
     def _set_band(self, band: int, head: tuple[int, ...], floats: tuple[float, ...]) -> None:
+        """Set the constants of a band, and the tile's SH degree to it; bands come in ascending order.
+
+        Args:
+            band: 1 to 4.
+            head: kind and bits per field, first word of the indices, of the table and of the rows.
+            floats: offset of the table, offset of the rows, step.
+        """
         self._constants[2 + 2 * band] = head
         self._constants[3 + 2 * band, :3] = np.array(floats, np.float32).view(np.uint32)
-        self._constants[1, 1] = (int(self._constants[1, 1]) & 0xFFFFFF) | band << 24
+        self._constants[1, 1] = (int(self._constants[1, 1]) & _BELOW_DEGREE) | band << 24
 
     def _append(self, words: Words) -> int:
-        """Append words after the geometry, and return the offset of the first."""
-        at = len(self._planes) * self._blocks * BLOCK + sum(len(run) for run in self._rest)
-        self._rest.append(words)
-        return at
+        """Append words after the geometry, and return the offset of the first from the tile's first word."""
+        offset = len(self._planes) * self._blocks * BLOCK + sum(len(run) for run in self._band_words)
+        self._band_words.append(words)
+        return offset
 
     def finish(self, corner: F64, step: float, ignored: int = 0) -> TileWords:
+        """Return the tile, with the words of the geometry block by block; for the arguments see `TileWords`."""
         planes = np.stack(self._planes).reshape(len(self._planes), self._blocks, BLOCK)
-        words = np.concatenate([planes.transpose(1, 0, 2).reshape(-1), *self._rest])
+        words = np.concatenate([planes.transpose(1, 0, 2).reshape(-1), *self._band_words])
         return TileWords(words, self._constants, np.asarray(corner, np.float64), step, self._splats, ignored)
 
 
 def _mean_fields(integers: NDArray[np.int64]) -> tuple[NDArray[np.uint32], list[int]]:
-    """Return fields [3, n] of integers from 0 on, and their bits; patterns if an axis is too wide."""
-    bits = [_bits_for(int(most)) for most in integers.max(axis=0)]
+    """Return fields [3, n] of integers [n, 3] from 0 on, and their bits; patterns if an axis exceeds `_MEAN_BITS`."""
+    bits = [_bits_for(int(largest)) for largest in integers.max(axis=0)]
     if max(bits) <= _MEAN_BITS:
         return integers.T.astype(np.uint32), bits
     return _patterns(integers).T, [_PATTERN] * 3
 
 
 def _fields_of(packed: PackedColumns) -> tuple[NDArray[np.uint32], int, F64]:
-    """Return fields [3, n], their common bits, and the offsets of the columns in scene units with the step."""
+    """Convert three columns to fields with common bits; to patterns if they exceed `_INTEGER_BITS`.
+
+    Returns:
+        [3, n], fields; bits; [4], offset of each column and the step, in the unit of the values, 0 for patterns.
+    """
     low = packed.integers.min(axis=0)
     fields = packed.integers - low
     bits = _bits_for(int(fields.max()))
@@ -292,7 +316,7 @@ def _fields_of(packed: PackedColumns) -> tuple[NDArray[np.uint32], int, F64]:
 
 
 def _pack_rows(packed: PackedColumns) -> _Rows:
-    """Pack rows of SH coefficients [n, 2 l + 1, 3]."""
+    """Pack rows of SH coefficients [n, 2 l + 1, 3], as patterns if they exceed `_INTEGER_BITS`; no words for n = 0."""
     if not len(packed.integers):
         return _Rows(np.zeros(0, np.uint32), 1, 0.0, packed.step)
     rows = packed.integers.reshape(len(packed.integers), -1)
@@ -304,8 +328,11 @@ def _pack_rows(packed: PackedColumns) -> _Rows:
 
 
 def _pack_fields(values: NDArray[Any], bits: int) -> Words:
-    """Pack the fields of each row [n, C], or a single row [n], as many per word as fit."""
-    per_word = 32 // bits
+    """Pack the fields of each row [n, C], or a single row [n], as many per word as fit, the first in the lowest bits.
+
+    `bits` is the width of a field, 1 to 32; each row begins with a new word.
+    """
+    per_word = _WORD_BITS // bits
     rows = values[None] if values.ndim == 1 else values
     padded = np.zeros((len(rows), -(-rows.shape[1] // per_word) * per_word), np.uint32)
     padded[:, : rows.shape[1]] = rows
@@ -315,9 +342,11 @@ def _pack_fields(values: NDArray[Any], bits: int) -> Words:
 
 
 def _patterns(values: NDArray[Any]) -> NDArray[np.uint32]:
+    """Return the binary32 patterns of values, in their shape; values beyond binary32 become infinite."""
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(values, np.float32).view(np.uint32)
 
 
-def _bits_for(most: int) -> int:
-    return max(1, most.bit_length())
+def _bits_for(largest: int) -> int:
+    """Return the number of bits of integers from 0 to `largest`, at least 1."""
+    return max(1, largest.bit_length())

@@ -40,6 +40,12 @@ _PIXEL_BYTES = 16  # four numbers of binary32
 _WORD_BYTES = 4  # of keys, values and sums
 _RANGE_BYTES = 8  # first and last pair of a screen tile
 _GROUP_COUNT_BYTES = 12  # of a row of the table of workgroups, three numbers
+_GROUPS_BYTES = 64  # of that table: its rows, and the arguments of a draw, 13 numbers
+_BLOCK_BYTES = 36  # of a block's splats in view: place of the first record, 8 words of bits, see cull.wgsl
+_DIGIT_BITS = 8  # of the keys that a pass of a sort sorts by
+_DIGITS = 1 << _DIGIT_BITS
+_KEY_BITS = 31  # of the largest depth, see `_LAST_KEY`
+_DEPTH_KEY_BITS = 32  # that the depth sort sorts by
 _CLEARED_PIXELS, _CLEARING_ROWS = 256, 64  # pixels per workgroup, and rows of workgroups that clear an image
 _LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
 _MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
@@ -150,7 +156,8 @@ class GpuScene:
         corners: list[F64] = []
         steps: list[float] = []
         page: list[NDArray[np.uint32]] = []
-        words = first_block = 0
+        words = 0  # of the page so far
+        first_block = 0  # of the page
         for tile in _tiles_of(scenes, tables, antialiased, sh_degree):
             if page and words + len(tile.words) > _PAGE_WORDS:
                 self._add_page(page, first_block)
@@ -197,17 +204,20 @@ class GpuScene:
             self.device.upload(self.tiles, self._places)
 
     def _upload(self, array: NDArray[Any], **usage: bool) -> Any:
+        """Return a buffer with the content of an array, and add its size to `size_bytes`."""
         buffer = self.device.uploaded(array, **usage)
         self.size_bytes += buffer.size
         return buffer
 
     def _add_page(self, runs: list[NDArray[np.uint32]], first_block: int) -> None:
+        """Append a page of the words of tiles, `runs`, whose blocks are `first_block` to `block_count`, to `pages`."""
         info = np.array([first_block, 0, 0, 0], np.uint32)
         words = self._upload(np.concatenate(runs))
         self.pages.append(Page(words, self._upload(info, uniform=True), self.block_count - first_block))
 
 
 def _origin_of(scene: PackedFile | HasSplats) -> tuple[float, float, float]:
+    """Return the origin of a scene; 0 0 0 if it has none."""
     origin = scene.header.origin if isinstance(scene, PackedFile) else getattr(scene, "origin", None)
     return origin or (0.0, 0.0, 0.0)
 
@@ -260,9 +270,9 @@ class GpuRenderer:
         self._size = (0, 0)
         self._view = device.buffer(_VIEW.itemsize, uniform=True)
         self._counters = device.buffer(_COUNTERS.itemsize)
-        self._groups = device.buffer(64, indirect=True)
-        self._blocks = device.buffer(36 * scene.block_count)
-        self._depths = device.buffer(4 << _DEPTH_BITS)
+        self._groups = device.buffer(_GROUPS_BYTES, indirect=True)
+        self._blocks = device.buffer(_BLOCK_BYTES * scene.block_count)
+        self._depths = device.buffer(_WORD_BYTES << _DEPTH_BITS)
         # The last record draws nothing, see bin.wgsl.
         self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * (self._records + 1)) for _ in range(2))
         keys, values = ([device.buffer(_WORD_BYTES * self._records) for _ in range(2)] for _ in range(2))
@@ -271,7 +281,7 @@ class GpuRenderer:
         self._pair_counts = device.buffer(_WORD_BYTES * self._records)
         self._projection = self._stages_of_projection(keys, values)
         self._count_depths = [
-            device.bind("cull", "count_depths", page.blocks, *self._page(page), None, self._depths)
+            device.bind("cull", "count_depths", page.blocks, *self._page_buffers(page), None, self._depths)
             for page in scene.pages
         ]
         self.pixels: Any = None
@@ -297,9 +307,9 @@ class GpuRenderer:
             counts = self.draw(camera, rows)
             pixels = self.device.read(self.pixels, _PIXEL_BYTES * len(rows) * camera.W).view(np.float32)
             pixels = pixels.reshape(len(rows), camera.W, 4)
-            left = np.abs(pixels[..., 3:])
-            rgb[rows.start : rows.stop] = pixels[..., :3] + left * colour
-            alpha[rows.start : rows.stop] = 1 - left[..., 0]
+            transmittance = np.abs(pixels[..., 3:])  # negative for finished pixels
+            rgb[rows.start : rows.stop] = pixels[..., :3] + transmittance * colour
+            alpha[rows.start : rows.stop] = 1 - transmittance[..., 0]
             visible, pairs, steps = visible + counts[0], pairs + counts[1], steps + counts[2]
         return GpuRender(rgb, alpha, self.scene.ignored, visible, pairs, steps)
 
@@ -336,7 +346,7 @@ class GpuRenderer:
             device.upload(self._view, view)
             stages = self._projection + self._step
             while True:
-                self._run(stages, times)
+                self._run_stages(stages, times)
                 counters = device.read(self._counters, _COUNTERS.itemsize).view(_COUNTERS)[0]
                 slice_count = int(counters["visible"])
                 if slice_count > self._records:
@@ -360,8 +370,8 @@ class GpuRenderer:
             self.draw(camera, rows, times)
         return times
 
-    def _run(self, stages: list[Stage], times: dict[str, float] | None) -> None:
-        """Run stages; with `times`, wait for them and add the milliseconds of each by name."""
+    def _run_stages(self, stages: list[Stage], times: dict[str, float] | None) -> None:
+        """Run stages, whose ranges of pairs are set to 0 first; with `times`, wait and add the milliseconds of each."""
         if times is None:
             self.device.run([call for _, calls in stages for call in calls], clear=[self._ranges])
             return
@@ -369,7 +379,10 @@ class GpuRenderer:
             times[name] = times.get(name, 0.0) + spent
 
     def _view_of(self, camera: Camera, rows: range) -> NDArray[Any]:
-        """Return the `View` of the rows of an image."""
+        """Return the uniform `View`, a scalar of `_VIEW`, of a band of an image, with a single slice of all depths.
+
+        It has the room for pairs of the last `_make_room`, so `bands` must be called before.
+        """
         values = view_vector(camera)
         view = np.zeros((), _VIEW)
         view["rows"][:, :3] = values[:9].reshape(3, 3)
@@ -387,10 +400,13 @@ class GpuRenderer:
         return view
 
     def _slices(self, view: NDArray[Any]) -> list[tuple[int, int]]:
-        """Return first and last key of slices of depth, each with as many splats as the records hold."""
+        """Return the first and last key of each slice of depth, with at most as many splats as the records hold.
+
+        If the records hold the whole scene, there is one slice, and nothing is counted on the GPU.
+        """
         starts = [0]
         if self.scene.block_count * BLOCK > self._records:
-            self._find_starts(view.copy(), starts, 0, (0, _LAST_KEY), 31 - _DEPTH_BITS)
+            self._find_starts(view.copy(), starts, 0, (0, _LAST_KEY), _KEY_BITS - _DEPTH_BITS)
         return list(zip(starts, [start - 1 for start in starts[1:]] + [_LAST_KEY], strict=True))
 
     def _find_starts(self, view: NDArray[Any], starts: list[int], count: int, keys: tuple[int, int], shift: int) -> int:
@@ -412,7 +428,7 @@ class GpuRenderer:
         view["first_key"], view["last_key"], view["depth_shift"] = *keys, shift
         self.device.upload(self._view, view)
         self.device.run(self._count_depths, clear=[self._depths])
-        counts = self.device.read(self._depths, 4 << _DEPTH_BITS).view(np.uint32)
+        counts = self.device.read(self._depths, _WORD_BYTES << _DEPTH_BITS).view(np.uint32)
         for place in np.flatnonzero(counts):
             key, key_count = keys[0] + (int(place) << shift), int(counts[place])
             if count + key_count <= self._records:
@@ -427,17 +443,23 @@ class GpuRenderer:
                 count = key_count
         return count
 
-    def _page(self, page: Page) -> tuple[Any, ...]:
+    def _page_buffers(self, page: Page) -> tuple[Any, ...]:
+        """Return the buffers of bindings 0 to 3 of the passes over a page, see cull.wgsl and project.wgsl."""
         return self._view, page.info, self.scene.tiles, page.words
 
     def _stages_of_projection(self, keys: list[Any], values: list[Any]) -> list[Stage]:
-        """Return the passes that find the visible splats of a slice, project them and sort them by depth."""
+        """Return the stages that find the visible splats of a slice, project them and sort them by depth.
+
+        Args:
+            keys: two buffers of `records` depths; the sort alternates between them.
+            values: two buffers of indices of records; after the sort, the first has the order of depth.
+        """
         bind, scene = self.device.bind, self.scene
-        culls = [bind("cull", "cull", page.blocks, *self._page(page), self._blocks) for page in scene.pages]
+        culls = [bind("cull", "cull", page.blocks, *self._page_buffers(page), self._blocks) for page in scene.pages]
         projections = [
             bind(
                 "project", "project", page.blocks,
-                *self._page(page), page.words, scene.tables, self._blocks, self._ellipses, self._looks, keys[0],
+                *self._page_buffers(page), page.words, scene.tables, self._blocks, self._ellipses, self._looks, keys[0],
             )
             for page in scene.pages
         ]  # fmt: skip
@@ -446,25 +468,33 @@ class GpuRenderer:
         return [
             ("cull", [*culls, compact, after]),
             ("project", projections),
-            ("depth sort", self._passes_of_sort(keys, values, 32, _SORT_RECORDS, of_pairs=False)),
+            ("depth sort", self._passes_of_sort(keys, values, _DEPTH_KEY_BITS, _SORT_RECORDS, of_pairs=False)),
         ]
 
     def _passes_of_sort(
         self, keys: list[Any], values: list[Any], bits: int, groups: int, *, of_pairs: bool
     ) -> list[Call]:
-        """Return the passes of a sort by some bits; the result is in the buffers of the number of passes modulo two."""
+        """Return the passes of a sort by the lower `bits` of the keys, for the GPU to run in this order.
+
+        Args:
+            keys, values: two buffers each, of which the first are sorted; the result is in those of the number of
+                digits modulo 2.
+            bits: number of bits of the keys; rounded up to whole digits.
+            groups: row of the table of workgroups, such as `_SORT_PAIRS`.
+            of_pairs: sort pairs of splat and tile; otherwise records, whose values are initially 0, 1, 2, ...
+        """
         device = self.device
-        table = device.buffer(4 * 256 * (1 + -(-keys[0].size // (4 * _RUN))))
+        table = device.buffer(_WORD_BYTES * _DIGITS * (1 + -(-keys[0].size // (_WORD_BYTES * _RUN))))
         calls = []
-        for digit in range(-(-bits // 8)):
+        for digit in range(-(-bits // _DIGIT_BITS)):
             radix = device.uploaded(
-                np.array([8 * digit, of_pairs, digit == 0 and not of_pairs, 0], np.uint32), uniform=True
-            )
+                np.array([_DIGIT_BITS * digit, of_pairs, digit == 0 and not of_pairs, 0], np.uint32), uniform=True
+            )  # `Pass` of sort.wgsl
             a, b = digit % 2, 1 - digit % 2
             here = self._groups, _GROUP_COUNT_BYTES * groups
             calls += [
                 device.bind("sort", "count", here, radix, self._counters, keys[a], None, None, None, table),
-                device.bind("sort", "scan", 256, radix, self._counters, keys[a], None, None, None, table),
+                device.bind("sort", "scan", _DIGITS, radix, self._counters, keys[a], None, None, None, table),
                 device.bind(
                     "sort", "scatter", here, radix, self._counters, keys[a], values[a], keys[b], values[b], table
                 ),
@@ -472,9 +502,19 @@ class GpuRenderer:
         return calls
 
     def _make_room(self, width: int, height: int) -> None:
-        """Set up the buffers whose size depends on the image, and the passes that use them."""
+        """Set up the buffers whose size depends on the image, and the passes that use them, unless they fit already.
+
+        If the GPU has too little memory for the pairs that are wanted, half of them are tried, and `_pairs_max` is
+        lowered for good.
+
+        Args:
+            width, height: size of a band, pixels.
+
+        Raises:
+            InputError: the GPU has too little memory even so.
+        """
         columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
-        least = BLOCK * columns * rows
+        least = BLOCK * columns * rows  # pairs of a block whose splats touch all screen tiles, so that a step takes it
         pairs = max(min(self._pairs_wanted, self._pairs_max), least)
         if (width, height) == self._size and pairs == self._pairs:
             return
@@ -489,14 +529,19 @@ class GpuRenderer:
             self._allocate(width, height, pairs)
 
     def _allocate(self, width: int, height: int, pairs: int) -> None:
-        """Set up the buffers and passes of `_make_room`; `pairs` is the room for pairs of splat and screen tile."""
+        """Set up what `_make_room` needs: `pixels`, `_ranges`, `_clear` and `_step`; then set `_size` and `_pairs`.
+
+        Args:
+            width, height: size of a band, pixels.
+            pairs: room for pairs of splat and screen tile.
+        """
         columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
         device, bind = self.device, self.device.bind
         self.pixels = device.buffer(_PIXEL_BYTES * width * height)
         self._ranges = device.buffer(_RANGE_BYTES * columns * rows)
         keys, values = ([device.buffer(_WORD_BYTES * pairs) for _ in range(2)] for _ in range(2))
         bits = max(1, (columns * rows - 1).bit_length())
-        done = -(-bits // 8) % 2
+        sorted_side = -(-bits // _DIGIT_BITS) % 2  # the buffers that hold the result of the sort
         records = self._ellipses, self._looks
         splats = self._view, self._counters, self._order, *records, self._sums, self._pair_counts
         blocks = self._groups, _GROUP_COUNT_BYTES * _BLOCKS_OF_RANKS
@@ -512,9 +557,16 @@ class GpuRenderer:
         ]  # fmt: skip
         sort = self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True)
         find = bind(
-            "ranges", "find", (self._groups, _GROUP_COUNT_BYTES * _SORT_PAIRS), self._counters, keys[done], self._ranges
+            "ranges",
+            "find",
+            (self._groups, _GROUP_COUNT_BYTES * _SORT_PAIRS),
+            self._counters,
+            keys[sorted_side],
+            self._ranges,
         )
-        blend = bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels)
+        blend = bind(
+            "blend", "blend", (columns, rows), self._view, *records, values[sorted_side], self._ranges, self.pixels
+        )
         following = bind("dispatch", "next_step", 1, None, self._counters)
         self._step = [("bin", bins), ("tile sort", [*sort, find]), ("blend", [blend, following])]
         self._size, self._pairs = (width, height), pairs

@@ -66,7 +66,7 @@ def _compare_view(
             renderer.draw(view, rows)
         pixels = len(rows) * camera.W
         runs = -(-pixels // _RUN)
-        backdrop = np.zeros(8, np.float32)
+        backdrop = np.zeros(8, np.float32)  # `Backdrop` of difference.wgsl
         backdrop[:3] = background
         backdrop.view(np.uint32)[4] = pixels
         differences = device.buffer(_SUM_BYTES * runs)

@@ -65,10 +65,13 @@ def find_model(folder: Path) -> tuple[Path, list[str]] | None:
     for names in _MODEL_FOLDERS:
         inside = [folder / name for name in names if (folder / name).is_dir()]
         models = [
-            path for parent in inside for path in (*sorted(parent.iterdir(), key=_number), parent) if _is_model(path)
+            path
+            for parent in inside
+            for path in (*sorted(parent.iterdir(), key=_number_key), parent)
+            if _is_model(path)
         ]
         if models:
-            return _largest(models, folder)
+            return _choose_largest(models, folder)
     return (folder, []) if _is_model(folder) else None
 
 
@@ -88,7 +91,7 @@ def read_colmap(
         InputError: a file is damaged, or no image exists.
     """
     folder = place.path
-    cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
+    cameras_path, images_path = _find_file(model, "cameras"), _find_file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
     images_text, cameras_text = images_path.with_suffix(".txt"), cameras_path.with_suffix(".txt")
@@ -103,7 +106,7 @@ def read_colmap(
     if (
         cameras_text != cameras_path
         and cameras_text.is_file()
-        and not _agree(cameras, read_cameras(cameras_text, used))
+        and not _are_equal(cameras, read_cameras(cameras_text, used))
     ):
         report.append(f"{cameras_text.name} has other cameras than {cameras_path.name}, which is read")
     if not registered:
@@ -111,14 +114,14 @@ def read_colmap(
     for image in registered:
         if image.camera not in cameras:
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
-    registered = _each_once(registered, images_path, report)
+    registered = _drop_repeated(registered, images_path, report)
     names = [image.name for image in registered]
-    image_files = find_images(place, names, images_path.name, _folders(place, model, images), size)
-    shown = "the folder itself" if image_files.folder == folder else _relative(image_files.folder, folder)
+    image_files = find_images(place, names, images_path.name, _image_folders(place, model, images), size)
+    shown = "the folder itself" if image_files.folder == folder else _relative_name(image_files.folder, folder)
     report.append(f"images from {shown}")
     report += image_files.notes
     report += describe_missing([name for name in names if name not in image_files.files], len(names), images_path.name)
-    masks = _masks(place, image_files.files, report)
+    masks = _find_image_masks(place, image_files.files, report)
     shots = [
         Shot(
             _shown_name(image.name, image_files),
@@ -130,7 +133,7 @@ def read_colmap(
         for image in registered
         if image.name in image_files.files
     ]
-    points, colours = _points(place, model, report)
+    points, colours = _read_model_points(place, model, report)
     lists, files = read_split_lists(place, (model, model.parent, folder))
     if lists:
         train, val, test = split_listed(shots, lists, files, report)
@@ -141,10 +144,10 @@ def read_colmap(
 
 def _shown_name(name: str, images: FoundImages) -> str:
     """Return the name of an image, or the name of its file if the former is not UTF-8."""
-    return name if name == printable(name) else printable(_relative(images.files[name], images.folder))
+    return name if name == printable(name) else printable(_relative_name(images.files[name], images.folder))
 
 
-def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
+def _drop_repeated(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
     """Drop repeated images with the same pose and camera.
 
     Raises:
@@ -161,65 +164,78 @@ def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> 
 
 
 def _is_model(folder: Path) -> bool:
-    return _file(folder, "cameras") is not None and _file(folder, "images") is not None
+    """Return True if a folder has files of cameras and of images."""
+    return _find_file(folder, "cameras") is not None and _find_file(folder, "images") is not None
 
 
-def _file(model: Path, name: str) -> Path | None:
+def _find_file(model: Path, name: str) -> Path | None:
     """Find a file of the model, binary before text, and empty files last."""
     there = [path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()]
     return next((path for path in there if path.stat().st_size), there[0] if there else None)
 
 
-def _number(path: Path) -> tuple[bool, int, str]:
-    """Sort numbered folders by number, before others."""
+def _number_key(path: Path) -> tuple[bool, int, str]:
+    """Return a key that sorts numbered folders by number, before others."""
     return not path.name.isdecimal(), int(path.name) if path.name.isdecimal() else 0, path.name
 
 
-def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
+def _choose_largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
+    """Return the model with the most images, the first of equal models; and a line on the others, if there are any."""
     if len(models) == 1:
         return models[0], []
-    counts = [_count(model) for model in models]
-    best = max(range(len(models)), key=counts.__getitem__)  # the first of equal models
+    counts = [_count_or_damaged(model) for model in models]
+    best = max(range(len(models)), key=counts.__getitem__)
     words = [f"{counts[i]}" if counts[i] >= 0 else "a damaged list of images" for i in range(len(models))]
-    others = ", ".join(f"{_relative(models[i], folder)} has {words[i]}" for i in range(len(models)) if i != best)
-    chosen = _relative(models[best], folder)
+    others = ", ".join(f"{_relative_name(models[i], folder)} has {words[i]}" for i in range(len(models)) if i != best)
+    chosen = _relative_name(models[best], folder)
     return models[best], [
         f"there are {len(models)} models: {chosen} is read, with {counted(max(counts), 'image')}; {others}"
     ]
 
 
-def _count(model: Path) -> int:
+def _count_or_damaged(model: Path) -> int:
     """Return the number of images of a model; -1 if it is damaged."""
-    path = _file(model, "images")
+    path = _find_file(model, "images")
     try:
         return -1 if path is None else count_images(path)
     except InputError:
         return -1
 
 
-def _folders(place: SetFolder, model: Path, images: str | None) -> tuple[str, ...]:
-    """Return the folders to search for images."""
+def _image_folders(place: SetFolder, model: Path, images: str | None) -> tuple[str, ...]:
+    """Return the folders to search for images, relative to the folder of the set.
+
+    Args:
+        place: the folder of the set.
+        model: folder of the sparse model.
+        images: the requested folder, which is then the only one; `None`: the usual folders.
+
+    Raises:
+        InputError: the requested folder does not exist, or is outside of the set.
+    """
     if images is not None:
         if not place.holds(place.path / images):
             raise place.refusal(Path(images))
         if not (place.path / images).is_dir():
             raise InputError(f"{place.path} has no folder {images}")
         return (images,)
+    if _UNDISTORTED_FIRST not in _relative_name(model, place.path).split("/"):
+        return _IMAGE_FOLDERS
     first, second, *others = _IMAGE_FOLDERS
-    return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, place.path).split("/") else _IMAGE_FOLDERS
+    return (second, first, *others)
 
 
-def _agree(cameras: dict[int, Lens], text_cameras: dict[int, Lens]) -> bool:
-    """Return True if cameras are equal up to the precision of text files."""
+def _are_equal(cameras: dict[int, Lens], text_cameras: dict[int, Lens]) -> bool:
+    """Return True if cameras have equal ids, sizes, fx and cx, up to the precision of text files."""
 
-    def numbers(some: dict[int, Lens]) -> list[tuple[float, ...]]:
-        return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(some.items())]
+    def rows(lenses: dict[int, Lens]) -> list[tuple[float, ...]]:
+        return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(lenses.items())]
 
-    return len(cameras) == len(text_cameras) and np.allclose(numbers(cameras), numbers(text_cameras), rtol=1e-4)
+    return len(cameras) == len(text_cameras) and np.allclose(rows(cameras), rows(text_cameras), rtol=_TEXT_TOLERANCE)
 
 
-def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
-    """Find the masks of images, and report images without a mask."""
+def _find_image_masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
+    """Find the masks of images, by names of images; report how they were found, and images without a mask."""
     names = list(images)
     masks = find_masks(place, images)
     if masks is None:
@@ -233,9 +249,9 @@ def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict
     return masks.files
 
 
-def _points(place: SetFolder, model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
-    """Read the points [M, 3] and colours [M, 3] of a model, or of the PLY that 3DGS writes."""
-    path = _file(model, "points3D")
+def _read_model_points(place: SetFolder, model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
+    """Read the points [M, 3] and colours [M, 3] of a model, or of the PLY that 3DGS writes; `None` without both."""
+    path = _find_file(model, "points3D")
     if path is not None:
         return read_points(place.checked(path), report)
     if (model / "points3D.ply").is_file():
@@ -244,10 +260,12 @@ def _points(place: SetFolder, model: Path, report: list[str]) -> tuple[F64, F32]
     return None, None
 
 
-def _relative(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, with `/`; the path itself if it is not below the folder."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
+_TEXT_TOLERANCE = 1e-4  # relative difference of cameras in text and binary files; text may have few digits
 _UNIT_TOLERANCE = 0.01  # tolerance of a quaternion's length; text files may hold few digits
 
 # Camera models, by their numbers in binary files.
@@ -292,7 +310,8 @@ _LAYOUTS = {
 
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?$")
 _ID_DIGITS = 20  # digits of the longest id or size; COLMAP counts in 64 bits
-_SHOWN = 80  # maximum number of characters of a word in a message
+_POSE_WORDS = 10  # in a line of images.txt: id, rotation (4), translation (3), camera, name, which may have spaces
+_WORD_SHOWN_MAX = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 
 
@@ -324,16 +343,16 @@ def read_cameras(path: Path, used: Collection[int] | None = None, report: list[s
     """
     cameras = {}
     if path.suffix == ".txt":
-        rows = list(_lines(path))
+        rows = list(_read_rows(path))
         _check_commas(path, [(words[2:], where) for words, where in rows], report)
         for words, where in rows:
-            number = _integer(words[0], where)
+            number = _parse_id(words[0], where)
             if used is not None and number not in used:
                 continue
             numbers = _parse_numbers(words[2:], where)
             if len(numbers) < 2:
                 raise InputError(f"{where}: expected id, model, width, height, parameters")
-            cameras[number] = _lens(words[1].upper(), numbers[0], numbers[1], numbers[2:], where)
+            cameras[number] = _make_lens(words[1].upper(), numbers[0], numbers[1], numbers[2:], where)
         return cameras
     data = _BinaryFile(path)
     for _ in range(data.read_count(_CAMERA_SIZE_MIN)):
@@ -343,7 +362,7 @@ def read_cameras(path: Path, used: Collection[int] | None = None, report: list[s
         parameter_count = len(_LAYOUTS.get(name, "").split())
         values = [float(value) for value in data.unpack(f"<{parameter_count}d")]
         if used is None or number in used or not parameter_count:  # the record size of an unknown model is unknown
-            cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
+            cameras[number] = _make_lens(name, float(width), float(height), values, f"{path}, camera {number}")
     data.end()
     return cameras
 
@@ -361,13 +380,13 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     entries: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, place in the file
     notes: list[str] = []
     if path.suffix == ".txt":
-        lines, notes = _image_lines(path)
-        _check_commas(path, [(line.split(None, 9)[1:8], where) for line, where in lines], notes)
+        lines, notes = _read_pose_lines(path)
+        _check_commas(path, [(line.split(None, _POSE_WORDS - 1)[1:8], where) for line, where in lines], notes)
         for line, where in lines:
-            words = line.split(None, 9)
-            if len(words) < 10:
+            words = line.split(None, _POSE_WORDS - 1)
+            if len(words) < _POSE_WORDS:
                 raise InputError(f"{where}: expected id, rotation, translation, camera and name")
-            entries.append((words[9].rstrip(), _integer(words[8], where), _parse_numbers(words[1:8], where), where))
+            entries.append((words[9].rstrip(), _parse_id(words[8], where), _parse_numbers(words[1:8], where), where))
     else:
         data = _BinaryFile(path)
         for _ in range(data.read_count(_IMAGE_SIZE_MIN)):
@@ -388,12 +407,12 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     if unnormalised:
         what = f"{counted(len(unnormalised), 'rotation')} QW QX QY QZ not of unit length, normalised"
         notes.append(f"{path.name}: {what}: {abbreviate(unnormalised)}")
-    return [ColmapImage(name, camera, _viewmat(pose, where)) for name, camera, pose, where in finite], notes
+    return [ColmapImage(name, camera, _viewmat_of_pose(pose, where)) for name, camera, pose, where in finite], notes
 
 
 def count_images(path: Path) -> int:
     """Count the images of images.bin or images.txt."""
-    return len(_image_lines(path)[0]) if path.suffix == ".txt" else _BinaryFile(path).read_count(_IMAGE_SIZE_MIN)
+    return len(_read_pose_lines(path)[0]) if path.suffix == ".txt" else _BinaryFile(path).read_count(_IMAGE_SIZE_MIN)
 
 
 def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
@@ -409,7 +428,7 @@ def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
     """
     points: list[tuple[float, ...]] = []
     if path.suffix == ".txt":
-        rows = list(_lines(path))
+        rows = list(_read_rows(path))
         _check_commas(path, [(words[1:8], where) for words, where in rows], report)
         for words, where in rows:
             if len(words) < 7:
@@ -438,13 +457,14 @@ class _BinaryFile:
         if instead:
             raise InputError(f"{path} is {instead}")
         self._path = path
-        self._at = 0
+        self._offset = 0
 
     def unpack(self, layout: str) -> tuple[Any, ...]:
+        """Read values of a `struct` layout; raise an `InputError` if the file ends before."""
         size = struct.calcsize(layout)
         self._need(size)
-        values = struct.unpack_from(layout, self._data, self._at)
-        self._at += size
+        values = struct.unpack_from(layout, self._data, self._offset)
+        self._offset += size
         return values
 
     def read_count(self, least_size: int) -> int:
@@ -461,36 +481,46 @@ class _BinaryFile:
         return count
 
     def string(self) -> str:
-        end = self._data.find(b"\0", self._at)
+        """Read a string that ends with a zero byte; bytes that are not UTF-8 become lone surrogates.
+
+        Raises:
+            InputError: the file ends before, or the string has control characters.
+        """
+        end = self._data.find(b"\0", self._offset)
         if end < 0:
-            raise InputError(f"{self._path} ends within a name at byte {self._at}")
-        name = self._data[self._at : end]
+            raise InputError(f"{self._path} ends within a name at byte {self._offset}")
+        name = self._data[self._offset : end]
         if any(byte < ord(" ") for byte in name):
-            raise InputError(f"{self._path}: the name at byte {self._at} has control characters")
-        self._at = end + 1
+            raise InputError(f"{self._path}: the name at byte {self._offset} has control characters")
+        self._offset = end + 1
         return name.decode("utf-8", "surrogateescape")  # COLMAP on Windows writes in the system's code page
 
     def skip(self, size: int) -> None:
+        """Pass over `size` bytes; raise an `InputError` if the file ends before."""
         self._need(size)
-        self._at += size
+        self._offset += size
 
     def end(self) -> None:
-        if self._at != len(self._data):
-            raise InputError(f"{self._path}: {len(self._data) - self._at} bytes follow its last record")
+        """Raise an `InputError` unless all bytes have been read."""
+        if self._offset != len(self._data):
+            raise InputError(f"{self._path}: {len(self._data) - self._offset} bytes follow its last record")
 
     def _need(self, size: int) -> None:
-        if size > len(self._data) - self._at:
-            raise InputError(f"{self._path} ends at byte {len(self._data)}, expected {size} more from byte {self._at}")
+        """Raise an `InputError` unless `size` bytes remain."""
+        if size > len(self._data) - self._offset:
+            raise InputError(
+                f"{self._path} ends at byte {len(self._data)}, expected {size} more from byte {self._offset}"
+            )
 
 
-def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
+def _read_rows(path: Path) -> Iterator[tuple[list[str], str]]:
     """Yield the words of each line that is neither empty nor a comment, and its place in the file."""
     for number, line in enumerate(read_text(path).split("\n"), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield line.split(), f"{path}, line {number}"
 
 
-def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
+def _read_pose_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """Separate the lines of poses in images.txt from the lines of keypoints that follow them.
 
     COLMAP writes two lines per image. The second, empty or with three numbers per keypoint, is often omitted in
@@ -503,31 +533,34 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     first = next((number for number, line in enumerate(lines) if line.strip() and not _is_comment(line)), len(lines))
     numbers = array("q", (number for number in range(first, len(lines)) if not _is_comment(lines[number])))
 
-    def pair(number: int) -> tuple[str, str]:
+    def with_place(number: int) -> tuple[str, str]:
         return lines[number], f"{path}, line {number + 1}"
 
     if all(_is_pose(lines[number]) for number in numbers[::2] if lines[number].strip()) and all(
         _is_keypoints(lines[number].split()) for number in numbers[1::2]
     ):
-        return [pair(number) for number in numbers[::2] if lines[number].strip()], []
+        return [with_place(number) for number in numbers[::2] if lines[number].strip()], []
+    # The lines are no pairs, so each is judged by its words, and keypoints may or may not follow a pose.
     poses: list[tuple[str, str]] = []
-    single = 0
-    expected = False  # a line of keypoints may follow
+    missing_count = 0
+    keypoints_may_follow = False
     for number in numbers:
         line = lines[number]
         if not _is_keypoints(line.split()):
-            single += expected
-            poses.append(pair(number))
-            expected = True
-        elif line.strip() and not expected:
+            if keypoints_may_follow:
+                missing_count += 1
+            poses.append(with_place(number))
+            keypoints_may_follow = True
+        elif line.strip() and not keypoints_may_follow:
+            place = with_place(number)[1]
             raise InputError(
-                f"{pair(number)[1]}: these are keypoints, expected an image: id, rotation, translation, camera, name"
+                f"{place}: these are keypoints, expected an image: id, rotation, translation, camera, name"
             )
         else:
-            expected = False
-    if not single:
+            keypoints_may_follow = False
+    if not missing_count:
         return poses, []
-    return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which is optional"]
+    return poses, [f"{path.name}: {counted(missing_count, 'image')} without a line of keypoints, which is optional"]
 
 
 def _is_comment(line: str) -> bool:
@@ -545,8 +578,9 @@ def _is_keypoints(words: list[str]) -> bool:
 
 
 def _is_pose(line: str) -> bool:
-    words = line.split(None, 9)
-    return len(words) == 10 and words[0].isdecimal() and words[8].isdecimal()
+    """Return True if a line has enough words, with whole numbers where a pose has the ids of image and camera."""
+    words = line.split(None, _POSE_WORDS - 1)
+    return len(words) == _POSE_WORDS and words[0].isdecimal() and words[8].isdecimal()
 
 
 def _parse_numbers(words: list[str], where: str) -> list[float]:
@@ -560,7 +594,7 @@ def _parse_numbers(words: list[str], where: str) -> list[float]:
         try:
             values.append(_parse_number(word))
         except ValueError:
-            raise InputError(f"{where}: {printable(word[:_SHOWN])!r} is not a number") from None
+            raise InputError(f"{where}: {printable(word[:_WORD_SHOWN_MAX])!r} is not a number") from None
     return values
 
 
@@ -574,15 +608,21 @@ def _parse_number(word: str) -> float:
 def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: list[str] | None) -> None:
     """Report decimal commas, as programs write in some languages.
 
+    Args:
+        path: the file.
+        rows: words that should be numbers, and their place in the file.
+        report: a line is appended if there are decimal commas; `None`: they are only checked.
+
     Raises:
         InputError: the file has other commas, or commas as well as points, so that either may separate thousands.
     """
-    comma = point = None
+    comma: tuple[str, str] | None = None  # the first word with a comma, and its place
+    point: tuple[str, str] | None = None
     for words, where in rows:
         for word in words:
             if "," in word:
                 if not _DECIMAL_COMMA.match(word):
-                    shown = printable(word[:_SHOWN])
+                    shown = printable(word[:_WORD_SHOWN_MAX])
                     raise InputError(f"{where}: {shown!r} has a comma, expected a number such as 0.5")
                 comma = comma or (word, where)
             elif "." in word and not _NO_NUMBER.match(word):
@@ -596,13 +636,25 @@ def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: lis
         report.append(f"{path.name}: decimal commas are read as points: {comma[0]} is {_parse_number(comma[0]):g}, …")
 
 
-def _integer(word: str, where: str) -> int:
+def _parse_id(word: str, where: str) -> int:
+    """Parse a whole number of at most `_ID_DIGITS` characters, else raise an `InputError`."""
     if len(word) > _ID_DIGITS or not re.fullmatch("-?[0-9]+", word):
-        raise InputError(f"{where}: {word[:_SHOWN]!r} is not an id")
+        raise InputError(f"{where}: {word[:_WORD_SHOWN_MAX]!r} is not an id")
     return int(word)
 
 
-def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
+def _make_lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
+    """Convert a camera of COLMAP.
+
+    Args:
+        model: name of the camera model, in capitals.
+        width, height: size of the images, pixels.
+        values: parameters of the model, in the order of `_LAYOUTS`.
+        where: place in the file, for messages.
+
+    Raises:
+        InputError: the model is not supported, or has other or impossible parameters.
+    """
     layout = _LAYOUTS.get(model, "").split()
     if not layout:
         remedy = SPLIT_PANORAMAS if is_panorama(model) else f"use {UNDISTORTER}"
@@ -627,8 +679,12 @@ def _lens(model: str, width: float, height: float, values: list[float], where: s
     return Lens(width, height, fx, fy, cx, cy, (k1, k2, k3), tangential, (k4, k5, k6), source=where)
 
 
-def _viewmat(pose: Sequence[float], where: str) -> F64:
-    """Return the matrix [4, 4] of a rotation w x y z and a translation."""
+def _viewmat_of_pose(pose: Sequence[float], where: str) -> F64:
+    """Return the matrix [4, 4] of a pose: a rotation w x y z of any length above 0, and a translation.
+
+    Raises:
+        InputError: the rotation is zero or overflows.
+    """
     q, t = np.array(pose[:4], np.float64), np.array(pose[4:7], np.float64)
     length = float(np.linalg.norm(q))
     if not (np.isfinite(length) and length > 0.0):

@@ -182,7 +182,7 @@ def read_split_lists(place: SetFolder, folders: Sequence[Path]) -> tuple[dict[st
         document = folder / _SCANNET
         if document.is_file():
             return _read_scannet_lists(place.checked(document)), document.name
-        files = {role: path for role in ROLES for path in _list_files(folder, role)[:1]}
+        files = {role: path for role in ROLES for path in _find_list_files(folder, role)[:1]}
         if files:
             texts = {role: read_text(place.checked(path), any_bytes=True) for role, path in files.items()}
             lists = {role: text.split("\n") for role, text in texts.items()}
@@ -191,6 +191,7 @@ def read_split_lists(place: SetFolder, folders: Sequence[Path]) -> tuple[dict[st
 
 
 def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
+    """Return the names by role; a role without a list is omitted. Raise an `InputError` without any list of names."""
     document = read_json(path, any_bytes=True)
     lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
     name_lists = {role: names for role, names in lists.items() if isinstance(names, list)}
@@ -199,7 +200,8 @@ def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
     return name_lists
 
 
-def _list_files(folder: Path, role: str) -> list[Path]:
+def _find_list_files(folder: Path, role: str) -> list[Path]:
+    """Find the text files that may list the images of a role, names in any case, `test.txt` before `test_list.txt`."""
     names = {path.name.casefold(): path for path in folder.glob("*.[tT][xX][tT]") if path.is_file()}
     return [names[name] for name in (f"{role}.txt", f"{role}_list.txt") if name in names]
 
@@ -298,6 +300,8 @@ def split_listed(
     return train, val, test
 
 
+_ALPHA_MIN = 1e-3  # of 255; divisor of interpolated colours where alpha is 0, and the colour does not matter
+
 # EXIF orientations that swap width and height, and the inverse: quarter turns anticlockwise, then a flip.
 _ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}
 
@@ -357,7 +361,7 @@ def _is_turned(image: Image.Image, lens: Lens) -> bool:
 
 
 def _turn_upright(pixels: U8, image: Image.Image) -> U8:
-    """Turn decoded pixels, [H, W, ...], as the file's EXIF specifies."""
+    """Turn decoded pixels, [H, W, ...], as the file's EXIF specifies, which is an orientation in `_ON_ITS_SIDE`."""
     quarters, flips = _ON_ITS_SIDE[image.getexif()[ExifTags.Base.Orientation]]
     turned = np.rot90(pixels, quarters)
     return turned[::-1] if flips else turned
@@ -366,7 +370,18 @@ def _turn_upright(pixels: U8, image: Image.Image) -> U8:
 def _read_pixels(
     path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
 ) -> U8:
-    """Return the undistorted pixels [H, W, 3 or 4] of a file in the requested size, `turned` by EXIF or as stored."""
+    """Read a file, undistort it, and scale it.
+
+    Args:
+        path: the file.
+        lens, straight: lens of the image as read, and the undistorted lens of the same size.
+        size: width and height of the result; `None`: those of the image.
+        turned: turn the image as EXIF specifies.
+        with_alpha: keep the alpha channel.
+
+    Returns:
+        [H, W, 3 or 4].
+    """
     with open_image(path) as stored:
         pixels = rgb_pixels(stored, path)
         if not with_alpha:
@@ -383,7 +398,13 @@ def _read_pixels(
 
 
 def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
-    """Return the pixels of an image that count, [H, W]: the mask, of any size, is brighter than half there."""
+    """Return the pixels of an image that count, [H, W]: the mask, scaled to its image, is brighter than half there.
+
+    Args:
+        path: the mask, of any size.
+        lens, straight: as for `_read_pixels`.
+        size: width and height of the result; `None`: those of the image.
+    """
     sides = int(lens.width), int(lens.height)
     with open_image(path, budget=False) as stored:  # compared with the size of its image before
         values = mask_values(stored, path).values
@@ -399,23 +420,23 @@ def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | N
 
 
 def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
-    """Undistort an image [H, W, C] by linear interpolation, with colours weighted by their alpha."""
+    """Undistort an image [H, W, C] by linear interpolation, RGBA with colours weighted by their alpha."""
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)
     channels = [pixels[..., i].astype(np.float64) for i in range(pixels.shape[2])]
     if len(channels) == 4:
         channels[:3] = [channel * channels[3] for channel in channels[:3]]
-    at = np.stack([y - 0.5, x - 0.5])
-    moved = [map_coordinates(channel, at, order=1, mode="nearest") for channel in channels]
+    positions = np.stack([y - 0.5, x - 0.5])  # for SciPy, the centre of the first pixel is 0
+    moved = [map_coordinates(channel, positions, order=1, mode="nearest") for channel in channels]
     if len(moved) == 4:
-        moved[:3] = [channel / np.maximum(moved[3], 1e-3) for channel in moved[:3]]
+        moved[:3] = [channel / np.maximum(moved[3], _ALPHA_MIN) for channel in moved[:3]]
     result: U8 = np.clip(np.rint(np.stack(moved, axis=2)), 0, 255).astype(np.uint8)
     return result
 
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-_GREY = 127.5
+_GREY = 127.5  # of 255; colour of points without colours
 
 
 def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:

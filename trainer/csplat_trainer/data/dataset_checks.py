@@ -196,16 +196,21 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[float, float]
 def _aspect_error(
     path: Path, size: tuple[int, int], expected: tuple[float, float], source: str, remedy: str
 ) -> InputError:
+    """Return the error for an image whose aspect ratio is not the expected one, that of the `source`."""
     actual, shape = f"{size[0]}×{size[1]}", f"{expected[0]:g}×{expected[1]:g}"
     return InputError(f"{path} has {actual} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
 
 
 def _aspect_mismatch(size: tuple[int, int], expected: tuple[float, float]) -> float:
     """Return the relative difference of an image's scales along both sides; 0 if rounding explains it."""
-    (low_x, high_x), (low_y, high_y) = (
-        ((side - _ROUNDING) / (expected_side + _ROUNDING), (side + _ROUNDING) / max(expected_side - _ROUNDING, 0.5))
-        for side, expected_side in zip(size, expected, strict=True)
-    )
+
+    def scale_range(side: int, expected_side: float) -> tuple[float, float]:
+        """Return the least and the largest scale that rounding of both sides allows."""
+        least_side = max(expected_side - _ROUNDING, 0.5)  # above 0
+        return (side - _ROUNDING) / (expected_side + _ROUNDING), (side + _ROUNDING) / least_side
+
+    low_x, high_x = scale_range(size[0], expected[0])
+    low_y, high_y = scale_range(size[1], expected[1])
     if max(low_x, low_y) <= min(high_x, high_y):
         return 0.0
     across, down = size[0] / expected[0], size[1] / expected[1]
@@ -213,6 +218,7 @@ def _aspect_mismatch(size: tuple[int, int], expected: tuple[float, float]) -> fl
 
 
 def _is_in_the_middle(lens: Lens) -> bool:
+    """Return True if the principal point is within `_MIDDLE` of both sides."""
     low, high = _MIDDLE
     return low <= lens.cx / lens.width <= high and low <= lens.cy / lens.height <= high
 

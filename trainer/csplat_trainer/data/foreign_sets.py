@@ -123,10 +123,12 @@ def describe_foreign(path: Path) -> str:
 
 
 def _any_case(pattern: str) -> str:
+    """Return a glob pattern that matches letters in any case."""
     return "".join(f"[{letter.lower()}{letter.upper()}]" if letter.isalpha() else letter for letter in pattern)
 
 
 def _has_mark(path: Path, mark: bytes) -> bool:
+    """Return True if the beginning of a file has a mark, in any case; for an empty mark, without reading it."""
     if not mark:
         return True
     try:

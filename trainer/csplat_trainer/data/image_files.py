@@ -38,8 +38,8 @@ IMAGE_ENDINGS = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp"),
     *(".avif", ".heic", ".heif", ".jp2", ".jxl", ".gif", ".exr"),
 )
-_SHOWN = 5  # largest number of names in a message
-_SHOWN_MAX = 200  # characters of each
+_NAMES_SHOWN = 5  # largest number of names in a message
+_NAME_LENGTH_MAX = 200  # largest number of characters of a name in a message
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
 _MASK_FOLDERS = ("masks", "mask", "_masks", "_mask")
@@ -52,7 +52,7 @@ _CODE_PAGES = {
     "utf-8": "UTF-8",
 }  # fmt: skip
 _MISREAD_AS = ("cp437", "cp850", "cp1252", "gb18030", "cp932", "cp950", "cp949")  # by programs that unpack archives
-_MOST = 0.5  # least fraction of the names that a code page has to explain
+_EXPLAINED_MIN = 0.5  # fraction of the names that a code page has to explain, at least
 
 _Key = Callable[[str], str]
 
@@ -109,9 +109,11 @@ def find_images(
     root = place.path
     groups = {folder: _size_folders(place, folder) for folder in dict.fromkeys(folders)}
     for loose in (False, True):
-        for folder in sorted(groups, key=lambda name: loose and name == "."):
+        for folder in sorted(groups, key=lambda name: loose and name == "."):  # the set's own folder last
             matches = [
-                match for path in groups[folder] if (match := _find_in(place, path, names, where, loose=loose)).files
+                match
+                for path in groups[folder]
+                if (match := _find_in_folder(place, path, names, where, loose=loose)).files
             ]
             if matches:
                 large = [match for match in matches[1:] if size is not None and _is_large(match, size)]
@@ -130,6 +132,7 @@ def find_images(
 
 
 def _refuse_outside(place: SetFolder, folders: Sequence[Path], names: Iterable[str], where: str) -> None:
+    """Raise an `InputError` for the first name that leads to a file outside of the set; `where` names the list."""
     for name in names:
         path = next((folder / name for folder in folders if place.finds_outside(folder / name)), None)
         if path is not None:
@@ -156,20 +159,20 @@ def find_masks(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | No
     if folder is None:
         return _masks_next_to(place, images)
     known, where = list(_images_below(folder)), f"{folder.name}/"
-    longer = {f"{name}.png": name for name in images}
-    files = {longer[name]: folder / name for name in known if name in longer}
-    left = [name for name in images if name not in files]
-    matched, notes = match_names(left, known, where)
+    image_of_mask = {f"{name}.png": name for name in images}
+    files = {image_of_mask[name]: folder / name for name in known if name in image_of_mask}
+    unmatched = [name for name in images if name not in files]
+    matched, notes = match_names(unmatched, known, where)
     if not matched:
-        shorter = {_without_affix(name): name for name in known}
-        matched, notes = match_names(left, shorter, where)
-        matched = {name: shorter[to] for name, to in matched.items()}
+        masks_without_affix = {_without_affix(name): name for name in known}
+        matched, notes = match_names(unmatched, masks_without_affix, where)
+        matched = {name: masks_without_affix[to] for name, to in matched.items()}
     files |= {name: folder / to for name, to in matched.items()}
     return FoundImages(folder, {name: place.checked(path) for name, path in files.items()}, notes)
 
 
 def _masks_next_to(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
-    """Find masks that are named like an image, followed by `.mask` and a suffix, in any case."""
+    """Find masks that are named like an image, followed by `.mask` and a suffix, in any case; `None` if none exists."""
     folders = {path.parent: {file.name.casefold(): file for file in path.parent.iterdir()} for path in images.values()}
     files = {}
     for name, path in images.items():
@@ -221,35 +224,36 @@ def match_names(
         InputError: a name matches two existing names, two names match the same name, or code pages contradict each
             other.
     """
-    left, free = dict.fromkeys(names), dict.fromkeys(known)
-    matched, notes = _match_by_rules(left, free, where, folders=folders)
-    left = {name: None for name in left if name not in matched}
+    listed, existing = dict.fromkeys(names), dict.fromkeys(known)  # without repetitions
+    matched, notes = _match_by_rules(listed, existing, where, folders=folders)
+    unmatched = [name for name in listed if name not in matched]
     taken = set(matched.values())
-    more, line = _match_code_pages(left, [name for name in free if name not in taken], where, folders=folders)
-    return matched | more, notes + line
+    unused = [name for name in existing if name not in taken]
+    translated, code_page_notes = _match_code_pages(unmatched, unused, where, folders=folders)
+    return matched | translated, notes + code_page_notes
 
 
 def _match_by_rules(
     names: Iterable[str], known: Iterable[str], where: str, *, folders: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Match names by rules 1 to 7; arguments and result are as in `match_names`."""
-    left, free = dict.fromkeys(names), dict.fromkeys(known)
+    unmatched, unused = dict.fromkeys(names), dict.fromkeys(known)
     matched: dict[str, str] = {}
     notes: list[str] = []
-    for words, rules in _rules(left, folders=folders):
-        if not left or (matched and words in _FOLDER_WORDS):
+    for words, keys in _matching_rules(unmatched, folders=folders):
+        if not unmatched or (matched and words in _FOLDER_WORDS):
             break
-        loose: dict[str, str] = {}
-        for listed_key, known_key in rules:
-            pairs = _match(left, free, listed_key, known_key, where)
+        noted: dict[str, str] = {}  # pairs of this rule that the report mentions
+        for listed_key, known_key in keys:
+            pairs = _match_by_keys(unmatched, unused, listed_key, known_key, where)
             for name, to in pairs.items():
-                del left[name], free[to]
+                del unmatched[name], unused[to]
             matched |= pairs
-            loose |= {name: to for name, to in pairs.items() if words and not _only_lacks_ending(name, to)}
-        if loose:
-            name, to = next(iter(loose.items()))
-            more = ", …" if len(loose) > 1 else ""
-            text = f"{counted(len(loose), 'name')} of {where} found {words}: {printable(name)} is {printable(to)}{more}"
+            noted |= {name: to for name, to in pairs.items() if words and not _only_lacks_ending(name, to)}
+        if noted:
+            name, to = next(iter(noted.items()))
+            more = ", …" if len(noted) > 1 else ""
+            text = f"{counted(len(noted), 'name')} of {where} found {words}: {printable(name)} is {printable(to)}{more}"
             notes.append(text)
     return matched, notes
 
@@ -257,29 +261,38 @@ def _match_by_rules(
 def _match_code_pages(
     names: Iterable[str], known: Sequence[str], where: str, *, folders: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Match names by rule 8; arguments and result are as in `match_names`."""
-    listed, existing = ([name for name in some if not name.isascii()] for some in (names, known))
+    """Match names by rule 8; arguments and result are as in `match_names`.
+
+    A code page translates either the listed or the existing names. A translation under which names contradict each
+    other is skipped; of the others, the one that matches most names is used.
+
+    Raises:
+        InputError: two translations match the same number of names, but different files.
+    """
+    listed = [name for name in names if not name.isascii()]
+    existing = [name for name in known if not name.isascii()]
     best: dict[str, tuple[dict[str, str], str]] = {}  # by the mapping, which several code pages may give
-    most = max(1.0, _MOST * len(listed))
-    stems = {_stem(name) for name in known}, {_stem(name) for name in listed}
+    least_count = max(1.0, _EXPLAINED_MIN * len(listed))
+    known_stems, listed_stems = {_stem(name) for name in known}, {_stem(name) for name in listed}
     for translate, title in _translations() if listed else ():
-        for forwards in (True, False):
-            ours, theirs = ({name: name for name in some} for some in (listed, known if forwards else existing))
-            given = ours if forwards else theirs
-            given = {read: name for name in given if (read := translate(name)) is not None and read != name}
-            if sum(_stem(name) in stems[not forwards] for name in given) < most:
+        for translates_listed in (True, False):
+            names_to_read, stems = (listed, known_stems) if translates_listed else (existing, listed_stems)
+            originals = {read: name for name in names_to_read if (read := translate(name)) is not None and read != name}
+            if sum(_stem(name) in stems for name in originals) < least_count:  # saves the time of most code pages
                 continue
-            ours, theirs = (given, theirs) if forwards else (ours, given)
+            ours = originals if translates_listed else {name: name for name in listed}
+            theirs = {name: name for name in known} if translates_listed else originals
             try:
                 pairs, _ = _match_by_rules(ours, theirs, where, folders=folders)
             except InputError:
                 continue
+            if len(pairs) < least_count:
+                continue
+            if len(pairs) > least_count:
+                best.clear()
+            least_count = float(len(pairs))
             pairs = {ours[name]: theirs[to] for name, to in pairs.items()}
-            if len(pairs) >= most:
-                if len(pairs) > most:
-                    best = {key: value for key, value in best.items() if len(value[0]) >= len(pairs)}
-                most = max(most, float(len(pairs)))
-                best.setdefault(repr(sorted(pairs.items())), (pairs, title))
+            best.setdefault(repr(sorted(pairs.items())), (pairs, title))
     if not best:
         return {}, []
     if len(best) > 1:
@@ -321,8 +334,18 @@ def printable(name: str) -> str:
         return name.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
-    """Yield the rules in order: a description, and functions that map matching listed and known names to equal keys."""
+def _matching_rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
+    """Yield the rules 1 to 7 in order.
+
+    Args:
+        names: the listed names. Their depths are read when rule 6 is requested, so the caller may remove names that
+            earlier rules matched.
+        folders: yield rules 6 and 7, too, once for each number of folders.
+
+    Yields:
+        A description for the report, "" for rule 1; and pairs of functions, to be tried in this order: a listed and a
+        known name match if the first gives the same key for the listed name as the second for the known name.
+    """
 
     def decode(name: str) -> str:
         return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
@@ -337,55 +360,64 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
         path = PurePosixPath(decode(name))
         return str(path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path)
 
-    def parts(name: str) -> list[str]:
+    def strip_and_fold(name: str) -> str:
+        return fold(strip_ending(name))
+
+    def split_parts(name: str) -> list[str]:
         return decode(name).strip("/").split("/")
 
     def in_any_case(listed: _Key, known: _Key) -> list[tuple[_Key, _Key]]:
         """Compare names in any case; then with any ending, too."""
         return [
             (lambda name: fold(listed(name)), lambda name: fold(known(name))),
-            (lambda name: fold(strip_ending(listed(name))), lambda name: fold(strip_ending(known(name)))),
+            (lambda name: strip_and_fold(listed(name)), lambda name: strip_and_fold(known(name))),
         ]
 
     def without_first(count: int) -> _Key:
-        return lambda name: "/".join(parts(name)[count:])
+        return lambda name: "/".join(split_parts(name)[count:])
 
-    def last(count: int) -> _Key:
-        return lambda name: "/".join(parts(name)[-count:])
+    def only_last(count: int) -> _Key:
+        return lambda name: "/".join(split_parts(name)[-count:])
 
     yield "", [(_as_written, _as_written)]
     yield "with / for \\, without surrounding spaces", [(normalise_name, normalise_name)]
     yield "as a URL", [(decode, normalise_name)]
     yield "in another Unicode form", [(compose, compose)]
     yield "in another case", [(fold, fold)]
-    yield "with another ending", [(strip_ending, strip_ending), (lambda name: fold(strip_ending(name)),) * 2]
+    yield "with another ending", [(strip_ending, strip_ending), (strip_and_fold, strip_and_fold)]
     if not folders:
         return
-    depths = {len(parts(name)) for name in names}
+    depths = {len(split_parts(name)) for name in names}
     for count in range(1, max(depths, default=0)):
         yield _FOLDER_WORDS[0], in_any_case(without_first(count), normalise_name)
     for count in sorted(depths):
-        yield _FOLDER_WORDS[1], in_any_case(normalise_name, last(count))
+        yield _FOLDER_WORDS[1], in_any_case(normalise_name, only_last(count))
 
 
 def _as_written(name: str) -> str:
+    """Return the key of rule 1: the name without `.` and empty parts."""
     return PurePosixPath(name).as_posix()
 
 
-def _match(
+def _match_by_keys(
     names: Iterable[str],
     known: Iterable[str],
     listed_key: _Key,
     known_key: _Key,
     where: str,
 ) -> dict[str, str]:
-    index: dict[str, list[str]] = {}
+    """Return the known name of each listed name with an equal key; names without one are omitted.
+
+    Raises:
+        InputError: a name matches two known names, or two names match the same known name.
+    """
+    known_by_key: dict[str, list[str]] = {}
     for name in known:
-        index.setdefault(known_key(name), []).append(name)
+        known_by_key.setdefault(known_key(name), []).append(name)
     matches: dict[str, str] = {}
-    taken: dict[str, str] = {}
+    taken: dict[str, str] = {}  # listed names by known names
     for name in names:
-        fitting = index.get(listed_key(name), [])
+        fitting = known_by_key.get(listed_key(name), [])
         if len(fitting) > 1:
             raise InputError(f"{where}: {name} matches {len(fitting)} files: {abbreviate(sorted(fitting))}")
         if fitting:
@@ -397,23 +429,28 @@ def _match(
 
 
 def _only_lacks_ending(name: str, known: str) -> bool:
+    """Return True if a known name is the listed name with a suffix, which Blender omits: no reason for a report."""
     return known.startswith(_as_written(name) + ".")
 
 
 def abbreviate(names: Sequence[str]) -> str:
     """Return the first few names, for a message."""
-    return ", ".join(printable(name)[:_SHOWN_MAX] for name in names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
+    more = ", …" if len(names) > _NAMES_SHOWN else ""
+    return ", ".join(printable(name)[:_NAME_LENGTH_MAX] for name in names[:_NAMES_SHOWN]) + more
 
 
 def _size_folders(place: SetFolder, folder: str) -> list[Path]:
-    """Find a folder, in any case, and folders of smaller images next to it, the largest images first."""
+    """Find a folder, in any case, and folders of smaller images next to it, the largest images first.
+
+    For `images`, these are `images_2`, `images_4`, …; none if the folder does not exist, or is outside of the set.
+    """
     path = place.path / folder
     if not place.holds(path):
         return []
     if folder == "." or not path.parent.is_dir():
         return [path] if path.is_dir() else []
     names = sorted(sibling.name for sibling in path.parent.iterdir() if sibling.is_dir())
-    for flags in (0, re.IGNORECASE):
+    for flags in (re.NOFLAG, re.IGNORECASE):
         matches = [
             match for name in names if (match := re.fullmatch(f"{re.escape(path.name)}(?:_([0-9]+))?", name, flags))
         ]
@@ -422,19 +459,25 @@ def _size_folders(place: SetFolder, folder: str) -> list[Path]:
     return []
 
 
-def _find_in(place: SetFolder, folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
+def _find_in_folder(place: SetFolder, folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
+    """Find images in a folder; `loose` allows rules 6 and 7, which are not used if any name exists as written.
+
+    Raises:
+        InputError: as for `match_names`; or an image is a link that leads out of the set.
+    """
     files = {name: path for name in names if place.finds(path := folder / name)}
-    left = [name for name in names if name not in files]
+    unmatched = [name for name in names if name not in files]
     notes: list[str] = []
-    if left and not (loose and files):
+    if unmatched and not (loose and files):
         taken = set(files.values())
         known = [name for name in _images_below(folder) if folder / name not in taken]
-        matched, notes = match_names(left, known, where, folders=loose)
+        matched, notes = match_names(unmatched, known, where, folders=loose)
         files |= {name: folder / to for name, to in matched.items()}
     return FoundImages(folder, {name: place.checked(path, where) for name, path in files.items()}, notes)
 
 
 def _is_large(images: FoundImages, size: tuple[int, int]) -> bool:
+    """Return True if the first image has at least the requested width and height."""
     width, height = image_size(next(iter(images.files.values())))
     return width >= size[0] and height >= size[1]
 

@@ -181,6 +181,7 @@ def value_range(path: Path) -> tuple[float, float, float]:
 
 
 def _has_others(image: ImageFile.ImageFile) -> bool:
+    """Return True if a file has more than one image; a TIFF is left at its second image."""
     if image.format != "TIFF":
         return int(getattr(image, "n_frames", 1)) > 1
     try:
@@ -191,6 +192,7 @@ def _has_others(image: ImageFile.ImageFile) -> bool:
 
 
 def _has_alpha(image: Image.Image) -> bool:
+    """Return True if an image has an alpha channel, or a transparent colour."""
     return image.mode in _WITH_ALPHA or "transparency" in image.info
 
 

@@ -32,6 +32,7 @@ SPLIT_PANORAMAS = (
     " --camera-type equirectangular`"
 )
 
+_BORDER_TOLERANCE = 1e-6  # pixels, for rounding
 _SMALL = 1e-8  # radius below which a projection is its limit
 
 
@@ -133,7 +134,10 @@ def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
 
 
 def _projection_factor(r: F64, lens: Lens) -> F64:
-    """Return the projected radius of a direction, divided by the tangent of its angle, `r`."""
+    """Return the projected radius of directions, divided by the tangents of their angles, `r`, of any shape.
+
+    The lens is equidistant or FOV; an omega near 0 is a pinhole, with the factor 1.
+    """
     tangent, scale = (2.0 * math.tan(lens.omega / 2.0), lens.omega) if lens.projection == "fov" else (1.0, 1.0)
     if abs(scale) < _SMALL:
         return np.ones_like(r)
@@ -142,7 +146,7 @@ def _projection_factor(r: F64, lens: Lens) -> F64:
 
 
 def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
-    """Return factors[0] r² + factors[1] r⁴ + …, by Horner's rule, skipping zeros at the end."""
+    """Return factors[0] r² + factors[1] r⁴ + …, by Horner's rule, skipping zeros at the end; 0 without factors."""
     last = max((i for i, factor in enumerate(factors) if factor != 0.0), default=0)
     total = r2 * (factors[last] if factors else 0.0)
     for factor in reversed(factors[:last]):
@@ -159,15 +163,16 @@ def _border(lens: Lens, count: int) -> tuple[F64, F64]:
 
 
 def _border_is_inside(lens: Lens, straight: Lens) -> bool:
+    """Return True if the border of the undistorted image is within the distorted image."""
     x, y = distorted(*_border(lens, _BORDER_POINTS), lens, straight)
-    margin = 0.5 - 1e-6  # colours are valid up to half a pixel beyond the outermost centres
+    margin = 0.5 - _BORDER_TOLERANCE  # colours are valid up to half a pixel beyond the outermost centres
     inside = (x >= 0.5 - margin) & (x <= lens.width - 0.5 + margin)
     inside &= (y >= 0.5 - margin) & (y <= lens.height - 0.5 + margin)
     return bool(inside.all())
 
 
 def _is_one_to_one(lens: Lens, straight: Lens) -> bool:
-    """Return True if distances from the principal point are monotonic, which polynomials may violate."""
+    """Return True if distances from the principal point do not fall along rays, as they may with polynomials."""
     u, v = _border(lens, _RAYS)
     along = np.linspace(0.0, 1.0, _RAY_POINTS)[:, None]
     x, y = distorted(lens.cx + along * (u - lens.cx), lens.cy + along * (v - lens.cy), lens, straight)

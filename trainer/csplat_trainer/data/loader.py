@@ -71,12 +71,12 @@ def load(
     place = SetFolder(path if path.is_dir() else path.parent, trust_paths, None if images is None else named)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
         raise InputError(f"size is {size[0]}×{size[1]}, expected 1 to {MAX_IMAGE_SIZE} pixels per side")
-    unread = _read(place, path, size, images, test_every)
+    unread = _read_by_kind(place, path, size, images, test_every)
     if not unread.train:
         raise InputError(f"{path} has no training images")
     doubts = describe_poses([*unread.train, *unread.test], unread.points)
     unread, origin = choose_origin(unread)
-    unread = _settle(unread, place)
+    unread = _resolve_links(unread, place)
     shots = [*unread.train, *unread.test]
     heads = {shot.path: read_image_header(shot.path) for shot in (*shots, *unread.val)}
     check_shots([*shots, *unread.val], heads)
@@ -156,6 +156,7 @@ def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
 
 
 def _is_set(folder: Path) -> bool:
+    """Return True if a folder has a file of frames, or a COLMAP model."""
     return any((folder / name).is_file() for name in _SETS) or find_model(folder) is not None
 
 
@@ -176,7 +177,7 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
     return custom, usual, ""
 
 
-def _settle(data: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
+def _resolve_links(data: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
     """Resolve the links of images and masks, so that the files read later are the files that were checked."""
     train, test, val = (
         [
@@ -188,9 +189,21 @@ def _settle(data: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
     return replace(data, train=train, test=test, val=val)
 
 
-def _read(
+def _read_by_kind(
     place: SetFolder, path: Path, size: tuple[int, int] | None, images: str | None, test_every: int
 ) -> UnreadDataSet:
+    """Read a set by the reader of its kind, without the pixels.
+
+    Args:
+        place: the folder of the set.
+        path: the set: a folder, or a file of frames.
+        size: requested width and height, by which a COLMAP set chooses its folder of images; `None`: the first folder.
+        images: name of the folder of images; `None`: chosen by the reader.
+        test_every: see `split_every`; not used for Blender sets.
+
+    Raises:
+        InputError: the path is no set, or its reader refuses it.
+    """
     if path.is_file() and (foreign := describe_foreign(path)):
         raise InputError(foreign)
     if path.is_file() and path.suffix.lower() == ".json":
@@ -200,7 +213,7 @@ def _read(
     if not path.is_dir():
         zipped = path.suffix.lower() == ".zip" and path.is_file()
         remedy = ": unpack it, and name the folder" if zipped else ""
-        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy or _suggest_images(path)}")
+        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy or _suggest_image_folders(path)}")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
         unread = read_blender(place, images)
@@ -209,12 +222,12 @@ def _read(
     elif model is not None:
         unread = read_colmap(place, model[0], size, images, test_every)
         return replace(unread, report=[*model[1], *unread.report])
-    elif not (place_hint := _suggest_place(path)) and (foreign := describe_foreign(path)):
+    elif not (place_hint := _suggest_subfolder(path)) and (foreign := describe_foreign(path)):
         raise InputError(foreign)
     else:
         raise InputError(
             f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint or _missing_poses(path)}"
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint or _suggest_poses(path)}"
         )
     if model is not None:
         unread = replace(unread, report=[*unread.report, "there is also a COLMAP model, which is ignored"])
@@ -223,23 +236,23 @@ def _read(
     return unread
 
 
-def _suggest_images(path: Path) -> str:
-    """Return the folders of images next to a path that does not exist, or ""."""
+def _suggest_image_folders(path: Path) -> str:
+    """Return a hint with the folders of images next to a path that does not exist, or ""."""
     siblings = sorted(path.parent.glob("*/")) if path.parent.is_dir() else []
     folders = [folder for folder in siblings if find_image_folder(folder)[1]]
     return f"; {path.parent} has {', '.join(folder.name for folder in folders)}" if folders else ""
 
 
-def _missing_poses(path: Path) -> str:
-    """Return a hint for a folder of images without camera poses."""
+def _suggest_poses(path: Path) -> str:
+    """Return a hint for a folder of images without camera poses; "" if there are no images either."""
     files = (file for folder in (path, path / "images", path / "input") for file in folder.glob("*"))
     if any(file.suffix.lower() in (".jpg", ".jpeg", ".png") for file in files):
         return "; there are images, but no camera poses: compute them with COLMAP first"
     return ""
 
 
-def _suggest_place(path: Path) -> str:
-    """Return a hint on the path of the data set, or ""."""
+def _suggest_subfolder(path: Path) -> str:
+    """Return a hint for a folder that is no set: the sets in it, or COLMAP's next step; "" if it has neither."""
     folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
     sets = [folder for folder in folders if _is_set(folder)]
     if sets:
@@ -311,6 +324,7 @@ def describe_outliers(data: DataSet) -> str:
 
 
 def _relative_to(shot: Shot, origin: F64) -> Shot:
+    """Return a shot for points relative to an origin [3]: its viewmat · (p − origin) is the old viewmat · p."""
     viewmat = shot.viewmat.copy()
     viewmat[:3, 3] += viewmat[:3, :3] @ origin
     return replace(shot, viewmat=viewmat)
@@ -374,5 +388,6 @@ def estimate_up_of_cameras(viewmats: Sequence[F64]) -> UpEstimate | None:
 
 
 def _measure_up(up: F64, angles: F64, *, by_horizons: bool) -> UpEstimate:
+    """Return an up direction [3] with its tilt, the median of the absolute angles of the cameras [V], radians."""
     tilt = float(np.degrees(np.median(np.abs(angles))))
     return UpEstimate(unit_up([float(value) for value in up]), tilt, by_horizons)

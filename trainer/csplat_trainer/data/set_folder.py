@@ -28,10 +28,12 @@ class SetFolder:
 
     @cached_property
     def _as_written(self) -> list[str]:
+        """The allowed folders, absolute, with links as they are."""
         return [_absolute(root) for root in (self.path, self.images) if root is not None]
 
     @cached_property
     def _real(self) -> list[str]:
+        """The allowed folders without links, as they are at the first access."""
         return [os.path.realpath(root) for root in (self.path, self.images) if root is not None]
 
     def holds(self, path: Path) -> bool:
@@ -96,10 +98,12 @@ class SetFolder:
 
 
 def _absolute(path: Path) -> str:
+    """Return an absolute path without `..`; links are not followed."""
     return os.path.abspath(path)  # noqa: PTH100  # resolve would ask the disk, or a server
 
 
 def _is_below(path: str, root: str) -> bool:
+    """Return True if an absolute path is a folder or below it, by its text alone, in any case on Windows."""
     try:
         return os.path.commonpath([os.path.normcase(path), os.path.normcase(root)]) == os.path.normcase(root)
     except ValueError:  # on another drive

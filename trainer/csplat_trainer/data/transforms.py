@@ -48,6 +48,7 @@ from csplat_trainer.data.set_folder import SetFolder
 _POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _RATIONAL = "FULL_OPENCV"
+_LIST_SHOWN_MAX, _NAME_SHOWN_MAX = 80, 200  # characters of a list and of a name in a message
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
@@ -64,19 +65,19 @@ def read_blender(place: SetFolder, images: str | None = None) -> UnreadDataSet:
     report: list[str] = []
     folder = place.path
     train_path = folder / "transforms_train.json"
-    train = _shots(place, _load(place, train_path), train_path, images, report)
+    train = _read_shots(place, _read_document(place, train_path), train_path, images, report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        test = _shots(place, _load(place, test_path), test_path, images, report, needed=False)
+        test = _read_shots(place, _read_document(place, test_path), test_path, images, report, needed=False)
     else:
         test = []
         report.append("there is no transforms_test.json: no test images")
     val_path = folder / "transforms_val.json"
     val = []
     if val_path.is_file():
-        val = _shots(place, _load(place, val_path), val_path, images, report, needed=False)
+        val = _read_shots(place, _read_document(place, val_path), val_path, images, report, needed=False)
     _check_distinct([*train, *test, *val], folder)
-    points, colours = _points_next_to(train, place, report)
+    points, colours = _read_points_next_to(train, place, report)
     return UnreadDataSet("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
 
 
@@ -92,11 +93,11 @@ def read_transforms(place: SetFolder, path: Path, test_every: int, images: str |
     Raises:
         InputError: the file has unexpected contents, or no image is found.
     """
-    document, report = _load(place, path), list[str]()
-    shots = _shots(place, document, path, images, report)
-    points, colours = _points(place, document, shots, path, report)
+    document, report = _read_document(place, path), list[str]()
+    shots = _read_shots(place, document, path, images, report)
+    points, colours = _read_points(place, document, shots, path, report)
     if "test_frames" in document:  # ScanNet++
-        test = _shots(place, document, path, images, report, key="test_frames", needed=False)
+        test = _read_shots(place, document, path, images, report, key="test_frames", needed=False)
         return UnreadDataSet("transforms.json set", shots, test, points, colours, report)
     lists = {role: names for role in ROLES if (names := _read_list(document, f"{role}_filenames", path))}
     files = path.name
@@ -133,7 +134,7 @@ class _Frame:
     values: Mapping[str, Any]
 
 
-def _shots(
+def _read_shots(
     place: SetFolder,
     document: Mapping[str, Any],
     path: Path,
@@ -143,15 +144,29 @@ def _shots(
     key: str = "frames",
     needed: bool = True,
 ) -> list[Shot]:
-    """Read the frames of a document that have an image and a pose; if `needed`, at least one."""
+    """Read the frames of a document that have an image and a pose; pixels stay unread.
+
+    Args:
+        place: the folder of the set.
+        document: contents of the file.
+        path: the file.
+        images: name of the folder of images; `None`: from the file.
+        report: lines on omitted frames, and on how images were found, are appended.
+        key: name of the list of frames.
+        needed: require at least one frame with an image.
+
+    Raises:
+        NoImagesError: `needed`, and no image exists.
+        InputError: a frame is invalid, or an image or the folder of images is outside of the set.
+    """
     folder = path.parent
-    frames = _frames(document, key, path, report, needed=needed)
+    frames = _check_frames(document, key, path, report, needed=needed)
     names = [frame.name for frame in frames]
     try:
         if images is not None and not place.holds(folder / images):
             raise place.refusal(Path(images))
         image_files = (
-            find_images(place, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
+            find_images(place, names, path.name, _image_folders(names, images)) if names else FoundImages(folder, {})
         )
     except NoImagesError:
         if needed:
@@ -161,27 +176,43 @@ def _shots(
         report.append(f"images from {image_files.folder.relative_to(folder).as_posix()}")
     report += image_files.notes
     report += describe_missing([name for name in names if name not in image_files.files], len(names), path.name)
-    masks = _masks(place, frames, path, report)
+    masks = _find_frame_masks(place, frames, path, report)
     shots = []
     for frame in frames:
         if frame.name in image_files.files:
             image, where = image_files.files[frame.name], f"{path}, frame {frame.number}"
             lens = _read_lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
-            shots.append(Shot(_plain(frame.name, image, place.path), image, lens, viewmat, masks.get(frame.name)))
+            name = _display_name(frame.name, image, place.path)
+            shots.append(Shot(name, image, lens, viewmat, masks.get(frame.name)))
     report += describe_scales(
         [frame.values["transform_matrix"] for frame in frames if frame.name in image_files.files], path.name
     )
     return shots
 
 
-def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[str], *, needed: bool) -> list[_Frame]:
-    """Check frames, and drop those that are marked as bad, have no pose, or are repeated."""
+def _check_frames(
+    document: Mapping[str, Any], field: str, path: Path, report: list[str], *, needed: bool
+) -> list[_Frame]:
+    """Check the frames of a list, and drop those that are marked as bad, have no finite pose, or are repeated.
+
+    Frames without `transform_matrix` are kept; they are refused when their pose is read, if their image exists.
+
+    Args:
+        document: contents of the file.
+        field: name of the list.
+        path: the file, for messages.
+        report: a line for each reason to drop frames is appended.
+        needed: require at least one frame.
+
+    Raises:
+        InputError: the list or a frame is invalid, or a name occurs with two poses.
+    """
     frames = document.get(field)
     if not isinstance(frames, list) or (needed and not frames):
         raise InputError(f"{path} lists no {field}")
     good: dict[str, _Frame] = {}
-    bad, lost, twice = [], [], []
+    bad, lost, repeated = [], [], []
     for number, frame in enumerate(frames):
         if not isinstance(frame, Mapping) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{path}, frame {number} has no file_path")
@@ -191,7 +222,7 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
         key = PurePosixPath(name).as_posix()
         if frame.get("is_bad") is True:
             bad.append(name)
-        elif _is_lost(frame):
+        elif _has_lost_pose(frame):
             lost.append(name)
         elif "transform_matrix" not in frame and "transform_matrix_start" in frame:
             raise InputError(
@@ -201,20 +232,20 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
         elif key not in good:
             good[key] = _Frame(name, number, frame)
         elif good[key].values.get("transform_matrix") == frame.get("transform_matrix"):
-            twice.append(name)
+            repeated.append(name)
         else:
             raise InputError(f"{path}, frame {number}: {name} occurs twice, with different poses; expected each once")
     for words, names in (("marked as bad", bad), ("without a finite pose", lost)):
         if names:
             report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, dropped: {abbreviate(names)}")
-    if twice:
-        report.append(f"{path.name}: {counted(len(twice), 'frame')} repeated, read once: {abbreviate(twice)}")
+    if repeated:
+        report.append(f"{path.name}: {counted(len(repeated), 'frame')} repeated, read once: {abbreviate(repeated)}")
     if needed and not good:
         raise InputError(f"{path}: none of its {len(frames)} frames has a pose")
     return list(good.values())
 
 
-def _is_lost(frame: Mapping[str, Any]) -> bool:
+def _has_lost_pose(frame: Mapping[str, Any]) -> bool:
     """Return True if a frame's pose is null, or has a number that is not finite, as when tracking was lost."""
     if "transform_matrix" not in frame:
         return False
@@ -225,7 +256,7 @@ def _is_lost(frame: Mapping[str, Any]) -> bool:
         return False  # invalid contents are reported later
 
 
-def _folders(names: Sequence[str], images: str | None) -> list[str]:
+def _image_folders(names: Sequence[str], images: str | None) -> list[str]:
     """Return the folders to search for images: the names' folder, then its last part, then the usual folders."""
     if images is not None:
         return [images]
@@ -233,8 +264,15 @@ def _folders(names: Sequence[str], images: str | None) -> list[str]:
     return [".", *([] if own.is_absolute() else [str(own)]), own.name or ".", "images", "input"]
 
 
-def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
-    """Find the masks of frames in `mask_path`, as in nerfstudio: black for pixels that do not count."""
+def _find_frame_masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
+    """Find the masks that frames name in `mask_path`, as in nerfstudio: black for pixels that do not count.
+
+    Returns:
+        Mask files by names of frames; a frame without `mask_path` has no mask.
+
+    Raises:
+        InputError: a `mask_path` is not a string, or a mask does not exist.
+    """
     named: dict[str, str] = {}
     for frame in frames:
         mask = frame.values.get("mask_path")
@@ -248,23 +286,30 @@ def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[
         return {}
     try:
         masks = list(dict.fromkeys(named.values()))
-        mask_files = find_images(place, masks, path.name, _folders(masks, None))
+        mask_files = find_images(place, masks, path.name, _image_folders(masks, None))
     except NoImagesError:
         mask_files = FoundImages(path.parent, {})
     report += mask_files.notes
     missing = next(((name, mask) for name, mask in named.items() if mask not in mask_files.files), None)
     if missing is not None:
-        raise InputError(f"{path}: the mask {missing[1][:200]!r} of {abbreviate([missing[0]])} does not exist")
+        name, mask = missing
+        raise InputError(f"{path}: the mask {mask[:_NAME_SHOWN_MAX]!r} of {abbreviate([name])} does not exist")
     return {name: mask_files.files[mask] for name, mask in named.items()}
 
 
-def _points(
+def _read_points(
     place: SetFolder, document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
 ) -> tuple[F64 | None, F32 | None]:
-    """Read points and colours [M, 3] of nerfstudio's `ply_file_path`, in the coordinates of the cameras."""
+    """Read points and colours [M, 3] of nerfstudio's `ply_file_path`, in the coordinates of the cameras.
+
+    Without `ply_file_path`, the points next to the set are read. If the named file does not exist, there are none.
+
+    Raises:
+        InputError: `ply_file_path` is not a string, is outside of the set, or is not a complete PLY.
+    """
     name = document.get("ply_file_path")
     if name is None:
-        return _points_next_to(shots, place, report)
+        return _read_points_next_to(shots, place, report)
     if not isinstance(name, str):
         raise InputError(f"{path}: ply_file_path is {name!r}, expected a name")
     candidates = (
@@ -282,7 +327,7 @@ def _points(
     return read_point_cloud(place.checked(cloud, path.name))
 
 
-def _points_next_to(train: Sequence[Shot], place: SetFolder, report: list[str]) -> tuple[F64 | None, F32 | None]:
+def _read_points_next_to(train: Sequence[Shot], place: SetFolder, report: list[str]) -> tuple[F64 | None, F32 | None]:
     """Read the points and colours [M, 3] that 3DGS and similar programs write next to a Blender set.
 
     If images have transparency, points are ignored: they are often random, and the visual hull is better.
@@ -298,22 +343,24 @@ def _points_next_to(train: Sequence[Shot], place: SetFolder, report: list[str]) 
 
 
 def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
+    """Return the names under a key, [] if it is absent or null; raise an `InputError` if they are no list of names."""
     names = document.get(key)
     if names is None:
         return []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"{path}: {key} is {str(names)[:80]}, expected a list of names")
+        raise InputError(f"{path}: {key} is {str(names)[:_LIST_SHOWN_MAX]}, expected a list of names")
     return names
 
 
-def _plain(name: str, image: Path, folder: Path) -> str:
+def _display_name(name: str, image: Path, folder: Path) -> str:
     """Return an image's name without `./`, with the ending that Blender omits; if not UTF-8, its name on disk."""
     if name != printable(name) and image.is_relative_to(folder):
         return printable(image.relative_to(folder).as_posix())
     return printable(PurePosixPath(normalise_name(name)).with_name(image.name).as_posix())
 
 
-def _load(place: SetFolder, path: Path) -> dict[str, Any]:
+def _read_document(place: SetFolder, path: Path) -> dict[str, Any]:
+    """Read a JSON object; raise an `InputError` for other contents, or a file outside of the set."""
     document = read_json(place.checked(path), any_bytes=True)
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a set of posed images: expected an object with frames")

@@ -77,7 +77,7 @@ class GsplatTuning:
         }
         for name, integers in columns.items():
             if integers.shape[1]:
-                slopes, bits = slopes_of(_counts(integers).cpu().numpy())
+                slopes, bits = slopes_of(_count_integers(integers).cpu().numpy())
                 costs.tables[name] = slopes
                 costs.bits += bits
         return costs
@@ -90,7 +90,7 @@ class GsplatTuning:
         v, alphas = self.parameters.tensors, self.parameters.device_alphas
         quantised = self._quantisers.quantise(v, alphas)
         splats = SplatTensors.of(quantised.decoded, quantised.alphas)
-        rendered, _ = self._rasteriser.render(splats, view.camera, self._background, _degree(quantised))
+        rendered, _ = self._rasteriser.render(splats, view.camera, self._background, _sh_degree(quantised))
         shown = rendered.detach()
         reference = self._images.reference(view.reference, self._background)
         value, slope = self._loss(corrected(gain, shown), reference, self._images.mask(view.mask))
@@ -118,7 +118,7 @@ class GsplatTuning:
         """Return the loss of a view, and the squared error summed over the values that count, clipped to 0..1."""
         quantised = self._quantised()
         splats = SplatTensors.of(quantised.decoded, quantised.alphas)
-        rendered = self._rasteriser.render(splats, view.camera, self._background, _degree(quantised))[0]
+        rendered = self._rasteriser.render(splats, view.camera, self._background, _sh_degree(quantised))[0]
         rendered, reference = corrected(gain, rendered), self._images.reference(view.reference, self._background)
         mask = self._images.mask(view.mask)
         error = (rendered.clamp(0, 1) - reference.clamp(0, 1)).double().square()
@@ -142,12 +142,13 @@ class GsplatTuning:
         return values
 
     def _quantised(self) -> QuantisedValues:
+        """Quantise the current values."""
         quantised: QuantisedValues = self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
         return quantised
 
     @torch.no_grad()
     def _add_costs(self, gradients: dict[str, Tensor], quantised: QuantisedValues, costs: RateTerm) -> None:
-        """Add the slopes of the rate term to gradients, as `RateTerm.add_to`."""
+        """Add the slopes of the rate term to gradients, as `RateTerm.add_to`, in place; tables stay on the device."""
         if self._costs is None or self._costs[0] is not costs:
             self._costs = costs, {name: self._rasteriser.upload(table) for name, table in costs.tables.items()}
         plan, tables = self._fixed.parameters, self._costs[1]
@@ -163,7 +164,14 @@ class GsplatTuning:
             self._add_colours(gradients["shN"], quantised.sh, tables["shN"], per_bit / plan.sh_step)
 
     def _add_colours(self, gradient: Tensor, integers: Tensor, table: Tensor, factor: float) -> None:
-        """Add the slopes of colours [n, K, 3]: Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2."""
+        """Add the slopes of colours: Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2, up to rounding.
+
+        Args:
+            gradient: [n, K, 3], changed in place.
+            integers: [n, K, 3], Y, Co, Cg.
+            table: [3 K, 2 · MAX_INTEGER + 1], slopes in bits per step.
+            factor: loss per bit over the quantisation step.
+        """
         slopes = factor * _slopes(table, integers.flatten(1)).reshape(integers.shape)
         chroma = 0.5**self._fixed.parameters.chroma_shift
         by_y, by_co, by_cg = slopes[..., 0], chroma * slopes[..., 1], chroma * slopes[..., 2]
@@ -175,23 +183,24 @@ class GsplatTuning:
 _ROOT2 = 2.0**0.5
 
 
-def _degree(quantised: QuantisedValues) -> int:
+def _sh_degree(quantised: QuantisedValues) -> int:
+    """Return the SH degree of decoded splats."""
     return math.isqrt(1 + quantised.decoded["shN"].shape[1]) - 1
 
 
-def _places(integers: Tensor) -> Tensor:
+def _table_places(integers: Tensor) -> Tensor:
     """Return the places of integers [n, C] in flat tables [C, 2 · MAX_INTEGER + 1]."""
     size = 2 * MAX_INTEGER + 1
     columns = torch.arange(integers.shape[1], device=integers.device) * size + MAX_INTEGER
     return integers.clamp(-MAX_INTEGER, MAX_INTEGER).long() + columns
 
 
-def _counts(integers: Tensor) -> Tensor:
+def _count_integers(integers: Tensor) -> Tensor:
     """Count the integers of each column, [C, 2 · MAX_INTEGER + 1]."""
     width, size = integers.shape[1], 2 * MAX_INTEGER + 1
-    return torch.bincount(_places(integers).flatten(), minlength=width * size).reshape(width, size)
+    return torch.bincount(_table_places(integers).flatten(), minlength=width * size).reshape(width, size)
 
 
 def _slopes(table: Tensor, integers: Tensor) -> Tensor:
-    """Return the slopes of integers [n, C]."""
-    return table.flatten()[_places(integers)]
+    """Return the slopes of integers [n, C] by the tables [C, 2 · MAX_INTEGER + 1] of their columns, [n, C]."""
+    return table.flatten()[_table_places(integers)]

@@ -152,7 +152,10 @@ def finetune(
 
 
 def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
-    """Return the training images of a data set, in front of the background that the scene records."""
+    """Return the training images of a data set, in front of the background that the scene records, else the set's.
+
+    Cameras become relative to the scene's origin.
+    """
     record = model.metadata.training
     background = data.background if record is None else record.background
     shift = np.subtract(model.origin, data.origin)
@@ -161,10 +164,20 @@ def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
 
 
 def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit; `source_index` is [N]."""
-    places = np.empty(int(source_index.max()) + 1, np.int64)
-    places[source_index] = np.arange(len(source_index))
-    rows = places[result.source_index]
+    """Check that the file holds the tuned values, bit for bit.
+
+    Args:
+        seen: the tuned values as dequantised, by row.
+        source_index: [N], index in the source of each row.
+        result: the file, with the indices in the source of its splats, in its own order.
+        decoded: the file's splats.
+
+    Raises:
+        RuntimeError: it does not.
+    """
+    row_of_source = np.empty(int(source_index.max()) + 1, np.int64)  # other indices stay undefined, and unused
+    row_of_source[source_index] = np.arange(len(source_index))
+    rows = row_of_source[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         if not np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]):
             raise RuntimeError(f"{name} of the file differ from the tuned ones: a bug of csplat, please report it")

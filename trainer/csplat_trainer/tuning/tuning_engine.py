@@ -114,6 +114,7 @@ class CpuTuning:
         return self._scene.free_values.copy()
 
     def _render(self, seen: DecodedValues, view: TuningView) -> F32:
+        """Render decoded values in a view, [H, W, 3], for `backward`; the next render overwrites the result."""
         return self._rasteriser.forward(
             seen, view.camera, background=self._background, antialiased=self._antialiased
         ).rgb

@@ -30,6 +30,7 @@ from csplat_trainer.tuning.tuning_engine import CpuTuning, TuningEngine
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
 from csplat_trainer.tuning.tuning_views import TuningViews
 
+_LOG_SIZE_MAX = 80.0  # largest log-size of a typical splat, the unit of moves, so that it fits float32
 _MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
 
 
@@ -97,7 +98,12 @@ class _BestValues:
 
 
 class _Tuning:
-    """A tuning by a `Fitter`: the scene, its views, the best values so far."""
+    """A tuning by a `Fitter`: the scene, its views, the best values so far.
+
+    Args:
+        fixed, views, options, outputs, context, size_bytes: as for `tune`.
+        show: called with the progress, every `log_every` steps and after the last.
+    """
 
     def __init__(
         self,
@@ -112,11 +118,12 @@ class _Tuning:
         self._views, self._options, self._outputs, self._show = views, options, outputs, show
         self._fixed, self._context = fixed, context
         self._engine = self._make_engine(None)
-        self._extent = float(np.exp(np.clip(np.median(np.median(fixed.encode_plan.model.scales, axis=1)), -80.0, 80.0)))
+        log_size = np.median(np.median(fixed.encode_plan.model.scales, axis=1))
+        self._typical_size = float(np.exp(np.clip(log_size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)))
         self._fitter = Fitter(len(views.train), options.iterations, options.seed)
         self._log = self._fitter.log
         self._log |= {"validations": [], "views": views.digest}
-        self._numbers = {id(view): number for number, view in enumerate(views.train)}
+        self._view_numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
         self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
 
@@ -169,7 +176,7 @@ class _Tuning:
             if self._controller is not None:
                 self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
         gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
-        value = self._engine.step(self._views.train[view], gain, self._rates(), fitter.rate)
+        value = self._engine.step(self._views.train[view], gain, self._learning_rates(), fitter.rate)
         if fitter.iteration == 1 and not math.isfinite(value.read().loss):  # the loss of the initial values
             raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
         return value
@@ -190,11 +197,12 @@ class _Tuning:
         """Current lambda, loss per bit and splat."""
         return self._options.byte_cost if self._controller is None else self._controller.byte_cost
 
-    def _rates(self) -> dict[str, float]:
+    def _learning_rates(self) -> dict[str, float]:
+        """Return the learning rates of the current step by group; means move in units of the typical splat's size."""
         options = self._options
         factor = options.learning_rate_factor(self._fitter.iteration)
         return {
-            "means": options.lr_means * self._extent * factor,
+            "means": options.lr_means * self._typical_size * factor,
             "quats": options.lr_quats * factor,
             "scales": options.lr_scales * factor,
             "sizes": options.lr_scales * factor,
@@ -204,6 +212,11 @@ class _Tuning:
         }
 
     def _make_engine(self, parameters: Parameters | None) -> TuningEngine:
+        """Return the engine of the requested device, with the state of a checkpoint or, for `None`, the initial one.
+
+        Raises:
+            InputError: a package or the GPU is absent.
+        """
         fixed, options, background = self._fixed, self._options, self._views.background
         if options.device == "cpu":
             return CpuTuning(fixed, options, background, parameters, self._context)
@@ -214,31 +227,40 @@ class _Tuning:
         return GsplatTuning(fixed, options, background, parameters)
 
     def _validate(self) -> None:
-        """Score on the validation views, and keep the values with the least sum of loss and rate term."""
+        """Score on the validation views, keep the best values, and end the run if it no longer improves.
+
+        The score is the loss plus the rate term or, with a target size, plus a penalty for its excess. The run ends
+        after `patience` scores without a gain since it has calmed (`has_calmed`), without scores of files that are too
+        large while lambda can still rise.
+
+        Raises:
+            InputError: a value is not finite.
+        """
         values = self._engine.free_values()
         if not all(np.isfinite(array).all() for array in vars(values).values()):
             raise InputError(f"a value is not finite at step {self._fitter.iteration}: try smaller learning rates")
-        total, error, count = 0.0, 0.0, 0
+        loss = 0.0
+        squared_error, value_count = 0.0, 0
         for view in self._views.validation:
             gain = None
-            if self._options.lr_exposure and id(view) in self._numbers:  # also a training view
-                gain = ImageGain(self._fitter.gains, self._numbers[id(view)], 0.0)
-            value, squares = self._engine.score(view, gain)
-            total += value.loss / len(self._views.validation)
-            error += squares
-            count += 3 * (view.camera.W * view.camera.H if view.mask is None else int(view.mask.sum()))
+            if self._options.lr_exposure and id(view) in self._view_numbers:  # also a training view
+                gain = ImageGain(self._fitter.gains, self._view_numbers[id(view)], 0.0)
+            value, view_error = self._engine.score(view, gain)
+            loss += value.loss / len(self._views.validation)
+            squared_error += view_error
+            value_count += 3 * (view.camera.W * view.camera.H if view.mask is None else int(view.mask.sum()))
         costs = self._engine.count(self._options.byte_cost)
-        psnr = psnr_of_mse(error / count)
+        psnr = psnr_of_mse(squared_error / value_count)
         size_bytes = len(self._fixed.encode(values).write().data)
-        shrinks = False
+        shrinks = False  # True if the file is too large, and lambda can still rise
         if self._controller is None:
-            score = total + costs.loss
+            score = loss + costs.loss
         else:
             excess = self._controller.excess(size_bytes, costs.bits)
             shrinks = excess > 0.0 and not self._controller.is_exhausted
-            score = total + _EXCESS_WEIGHT * excess
+            score = loss + _EXCESS_WEIGHT * excess
         self._log["validations"].append(
-            {"iteration": self._fitter.iteration, "loss": total, "psnr": psnr, "size_bytes": size_bytes}
+            {"iteration": self._fitter.iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
         )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
             self._best = _BestValues(values, score, psnr, self._fitter.iteration)
@@ -247,6 +269,7 @@ class _Tuning:
             self._fitter.has_ended = 0 < self._options.patience <= self._best.since
 
     def _save(self, path: str | Path) -> None:
+        """Write a checkpoint, with the best values, the rate term and its controller; call `_validate` before."""
         assert self._best is not None
         best, rate = vars(self._best).copy(), self._fitter.rate
         arrays = {f"best_{name}": getattr(best["values"], name) for name in _FREE_VALUES}
@@ -264,6 +287,7 @@ class _Tuning:
         )
 
     def _full_log(self) -> dict[str, Any]:
+        """Return the log of the steps with facts on the run; gains and biases of images if they were trained."""
         assert self._best is not None
         return {
             "options": asdict(self._options),
@@ -285,7 +309,9 @@ class _Tuning:
 _TARGET_FRACTION = 0.6  # fraction of the steps after which the size should be reached; later steps hardly move values
 _SIZE_MARGIN = 0.002  # fraction of the size left free, since files grow between counts
 _EXCESS_WEIGHT = 1e3  # loss per relative excess of the size: values that fit win over others
-_GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(lambda) per relative excess of bits, and its limit at each count
+_RATE_GAIN = 40.0  # change of log(lambda) per relative excess of bits
+_LOG_CHANGE_MAX = 0.5  # largest change of log(lambda) at a count
+_GOAL_BITS_MIN = 0.1  # least number of bits to aim at, as a fraction of the current number
 _WEIGHT_RANGE = (1e-7, 1e-2)  # range of lambda
 # Smallest lambda, as a fraction of the first. Files grow while values move far, and a lambda near 0 would then rise too
 # late.
@@ -335,7 +361,7 @@ class RateController:
         """
         allowed = (1.0 - _SIZE_MARGIN) * self.size_bytes
         self.first_bits = self.first_bits or bits
-        self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), 0.1 * bits)
+        self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), _GOAL_BITS_MIN * bits)
         return max(0.0, size_bytes / self.size_bytes - 1.0)
 
     def update(self, bits: float, done: float, first_cost: float) -> None:
@@ -347,7 +373,7 @@ class RateController:
             first_cost: lambda at the start of the run.
         """
         planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_FRACTION)
-        by = min(max(_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
+        by = min(max(_RATE_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_LOG_CHANGE_MAX), _LOG_CHANGE_MAX)
         least = max(_MIN_WEIGHT_FRACTION * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
         self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
 

@@ -206,7 +206,11 @@ class GltfDocument:
         return self._buffers[index]
 
     def _read_uri(self, uri: str, json_path: JsonPath) -> memoryview:
-        """Return the bytes of a base64 data URI, or of a file in the folder of the document."""
+        """Return the bytes of a base64 data URI, or of a file in the folder of the document.
+
+        Raises:
+            InputError: the URI is invalid, leads out of the folder, or names a file that cannot be read.
+        """
         if uri.startswith("data:"):
             kind, _, text = uri.partition(",")
             if not kind.endswith(";base64"):
@@ -313,6 +317,7 @@ class GltfDocument:
         return to_world
 
     def _list(self, holder: dict[str, Any], json_path: JsonPath, key: str) -> list[Any]:
+        """Return the list that a member holds, empty if it is absent; raise an `InputError` for another type."""
         values: list[Any] = self.get(holder, json_path, key, list, [])
         return values
 
@@ -340,7 +345,7 @@ class GltfDocument:
         ]
 
     def _numbers(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: Any) -> F64:
-        """Return a list of numbers, float64, as many as the default has."""
+        """Return a list of numbers, float64, as many as the default has; raise an `InputError` for anything else."""
         values = holder.get(key, list(default))
         good = isinstance(values, list) and len(values) == len(default)
         if not good or not all(type(value) in (int, float) and abs(value) < _NUMBER_MAX for value in values):
@@ -370,7 +375,13 @@ def open_document(path: Path) -> GltfDocument:
 
 
 def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None, int]:
-    """Return the chunks JSON and BIN of a .glb, and the number of bytes after its declared end."""
+    """Return the chunks JSON and BIN of a .glb, and the number of bytes after its declared end.
+
+    BIN is `None` if it is not the second chunk. Zeros after the JSON are removed.
+
+    Raises:
+        InputError: the file is truncated, of another version, or does not begin with JSON.
+    """
     if len(data) < GLB_HEAD.size:
         raise InputError(f"{path.name} is truncated: {counted(len(data), 'byte')}")
     _, version, size = GLB_HEAD.unpack_from(data)
@@ -404,10 +415,12 @@ def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _as_list(value: object) -> list[Any]:
+    """Return a value if it is a list, otherwise an empty list."""
     return value if isinstance(value, list) else []
 
 
 def _list_names(value: object) -> str:
+    """Format the member names of an object for messages; another value is shortened."""
     return ", ".join(map(str, value)) if isinstance(value, dict) else _shorten(value)
 
 

@@ -57,7 +57,10 @@ _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_meta
 _LARGE = 1e6  # huge values are only counted in primitives with a value above this
 _FAR = 4096.0  # scene units; a larger translation becomes the origin: float32 resolves it to 0.0005 at best
 _ALIKE = 0.1  # fraction of the scene's extent by which equivalent bounds may differ
+_STRETCHES = (1e-30, 1e30)  # range of the largest singular value of a node's transform: beyond, lengths leave float32
+_SINGULAR = 1e-9  # a transform whose singular values have a smaller ratio is singular
 _SAMPLE = 4096  # number of splats on which the error of fitted colours is measured
+_SHOWN_NAME = 60  # characters of a program's name in messages
 _UNPACKED_RATIO = 1032  # maximum expansion by deflate; exceeded if several views share their bytes
 
 
@@ -147,7 +150,8 @@ class _GltfReading:
             linear, translation = matrix[:3, :3], matrix[:3, 3]
             with np.errstate(all="ignore"):
                 lengths = np.linalg.svd(linear)[1] if np.isfinite(matrix).all() else np.zeros(3)
-            if not 1e-30 < lengths.max() < 1e30 or lengths.min() < 1e-9 * lengths.max():
+            largest = lengths.max()
+            if not _STRETCHES[0] < largest < _STRETCHES[1] or lengths.min() < _SINGULAR * largest:
                 raise self.file.error(placed.json_path, "the transform of its node is singular or exceeds float32")
             yield _Instance(block, count, linear, translation)
 
@@ -249,6 +253,9 @@ class _GltfReading:
 
         Returns:
             A function that decodes rows, and the number of rows.
+
+        Raises:
+            InputError: the SPZ is invalid, or all SPZ together unpack to too many bytes.
         """
         file = self.file
         if view not in self.packed:
@@ -284,7 +291,10 @@ class _GltfReading:
     def _lies_as_stored(
         self, packed: SpzArrays, positions: dict[str, Any], rotation: F64, *, draft: bool
     ) -> tuple[bool, str]:
-        """Return True if positions are stored along glTF's axes; and the evidence for messages."""
+        """Return True if positions are stored along glTF's axes; and the evidence for messages.
+
+        The bounds of the accessor `positions` decide if they fit either reading, otherwise `draft` does.
+        """
         bounds = [positions.get(name) for name in ("min", "max")]
         numbers = [number for bound in bounds if isinstance(bound, list) for number in bound]
         if len(numbers) == 6 and packed.count and all(type(number) in (int, float) for number in numbers):
@@ -295,9 +305,10 @@ class _GltfReading:
                 low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
             as_stored = np.stack([low, high])
             rotated = np.sort(as_stored @ rotation.T, axis=0)
-            off = [float(np.abs(box - declared).max()) for box in (as_stored, rotated)]
-            if min(off) <= _ALIKE * float((high - low).max()) and off[0] != off[1]:
-                return off[0] < off[1], "according to the bounds of POSITION"
+            error_stored, error_rotated = (float(np.abs(box - declared).max()) for box in (as_stored, rotated))
+            nearest = min(error_stored, error_rotated)
+            if nearest <= _ALIKE * float((high - low).max()) and error_stored != error_rotated:
+                return error_stored < error_rotated, "according to the bounds of POSITION"
         return draft, "as CesiumJS reads such drafts"
 
 
@@ -341,12 +352,15 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
 
 
 def _conclude(reading: _GltfReading) -> None:
-    """Classify the values of all primitives and report findings about them."""
+    """Set `are_logs` and `are_logits` by the values of all primitives, which were read before, and add the findings.
+
+    Raises:
+        InputError: a sample of linear colours has values that a model refuses.
+    """
     generator = reading.file.root["asset"].get("generator")
-    writer = generator[:60] if isinstance(generator, str) else ""
+    writer = generator[:_SHOWN_NAME] if isinstance(generator, str) else ""
     reading.are_logs, scale_findings = classify_scales(reading.scales, "SCALE", strict=True, writer=writer)
-    written = _WROTE_LOGS.match(writer)
-    if written and not reading.are_logs and not scale_findings:
+    if _WROTE_LOGS.match(writer) and not reading.are_logs and not scale_findings:
         text = f"SCALE: {writer} wrote logarithms, but none is negative: read as standard deviations, as glTF specifies"
         scale_findings = [Finding("unclear-scales", reading.count, text, "note")]
     reading.are_logits, opacity_findings = classify_opacities(reading.opacities, "OPACITY")
@@ -405,7 +419,7 @@ def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.b
 
 
 def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: int, rows: slice) -> SplatModel:
-    """Return a model of some splats in the coordinates of their primitive."""
+    """Return a model of some splats in the coordinates of their primitive, without rows that are not finite."""
     values = {name: accessor.values(rows) for name, accessor in arrays.items()}
     good, _ = _finite_rows(arrays, rows) if reading.statistics.nonfinite else (None, 0.0)
     if good is not None:
@@ -431,6 +445,7 @@ def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: in
 
 
 def _decode_in_srgb(block: Callable[[slice], SplatModel], rows: slice) -> SplatModel:
+    """Decode some splats of linear colours, and fit their SH to sRGB."""
     return fit_srgb(block(rows))
 
 
@@ -441,7 +456,7 @@ def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
 
 
 def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> SplatModel:
-    """Transform some splats from their primitive to the scene."""
+    """Transform some splats from their primitive to the scene, with the origin and metadata of `empty`."""
     if not np.array_equal(instance.linear, np.eye(3)):
         block = stretch_scene(block, instance.linear)
     offset = instance.translation - np.array(empty.origin)
@@ -452,7 +467,11 @@ def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> S
 
 
 def _read_comments(file: GltfDocument) -> CommentMetadata:
-    """Read the metadata that our writer adds to the asset; the licence is also read from its copyright."""
+    """Read the metadata that our writer adds to the asset; without a licence there, its copyright is the licence.
+
+    Raises:
+        InputError: the metadata is not a list of strings, or a string is not a valid comment.
+    """
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
@@ -501,6 +520,7 @@ def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
 
 
 def _srgb(linear: F32) -> F32:
+    """Convert linear values >= 0 to sRGB (IEC 61966-2-1), elementwise."""
     high = np.float32(1.055) * linear ** np.float32(1 / 2.4) - np.float32(0.055)
     colours: F32 = np.where(linear <= np.float32(0.0031308), np.float32(12.92) * linear, high)
     return colours

@@ -24,6 +24,9 @@ _LARGEST_JSON = 1 << 25  # bytes
 _LARGEST_PART = 1 << 30  # bytes
 _LONGEST_NAME = 200  # characters
 _SHOWN = 80  # characters of a name in messages
+_SHOWN_REASON = 120  # characters of a library's error in messages
+_LARGEST_NUMBER = 1e30  # in magnitude, well within float32
+_RIFF_HEAD_SIZE = 12  # bytes before the first chunk of a WebP
 _ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of a single scene, and of a scene in levels
 _OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
 _NAMED = 5  # maximum number of scenes that a message lists
@@ -80,7 +83,7 @@ class _ZipDirectory:
         try:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
-            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            reason = " ".join(str(error).split())[:_SHOWN_REASON] or type(error).__name__
             if "not a zip file" in reason:  # it begins like a zip
                 reason = "its end is missing, where its list of files is"
             raise InputError(f"{self._title}: a damaged zip: {reason}: copy or download it again") from None
@@ -194,7 +197,7 @@ class SogParts:
         try:
             return self.zip.read(info)
         except DAMAGED as error:
-            self.refuse(f"{name[:_SHOWN]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
+            self.refuse(f"{name[:_SHOWN]}: {' '.join(str(error).split())[:_SHOWN_REASON] or type(error).__name__}")
 
     def json(self, name: str) -> JsonValue:
         """Read and parse a JSON part."""
@@ -253,7 +256,7 @@ class JsonValue:
                 f"{self.json_path} has {len(values)} numbers, expected {least if least == most else most}"
             )
         for number in values:
-            if type(number) not in (int, float) or not abs(number) <= 1e30 or not math.isfinite(number):
+            if type(number) not in (int, float) or not abs(number) <= _LARGEST_NUMBER or not math.isfinite(number):
                 self.parts.refuse(f"{self.json_path} contains {str(number)[:40]}, expected finite numbers")
         return np.array(values, np.float64)
 
@@ -306,6 +309,7 @@ def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -
 
 
 def _is_manifest(path: PurePosixPath) -> bool:
+    """Return True for the JSON of a SOG or streamed SOG, except in the folder that macOS adds to zips."""
     return path.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in path.parts
 
 
@@ -330,11 +334,13 @@ def _only_scene(parts: SogParts, manifests: Sequence[PurePosixPath]) -> PurePosi
 
 
 def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoReturn:
+    """Raise an `InputError` about several scenes in a zip or folder."""
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
     parts.refuse(f"it contains {len(scenes)} scenes, expected one ({_list_paths(scenes)}): {remedy}")
 
 
 def _list_paths(paths: Sequence[PurePosixPath]) -> str:
+    """Format the first `_NAMED` paths for messages, in alphabetical order."""
     return ", ".join(str(path)[:_SHOWN] for path in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
 
 
@@ -362,10 +368,10 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
 
 def _is_lossy(data: bytes) -> bool:
     """Return True if a WebP has a chunk of lossy pixels (RFC 9649, 2.5)."""
-    at = 12
+    at = _RIFF_HEAD_SIZE
     while len(data) >= at + 8:
         if data[at : at + 4] == b"VP8 ":
             return True
         size = int.from_bytes(data[at + 4 : at + 8], "little")
-        at += 8 + size + size % 2
+        at += 8 + size + size % 2  # chunks begin at even offsets
     return False

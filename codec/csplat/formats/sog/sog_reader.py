@@ -29,8 +29,10 @@ from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, I64, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
+_MAX_VERSION = 1 << 30  # larger numbers are no versions
 _CODES = 256  # codes of a byte of an image
 _KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # a meta.json of another program has none of these
+_SHOWN = 80  # characters of a name in messages
 _Range = tuple[int, int, int]  # file index, first splat, end
 
 
@@ -109,20 +111,21 @@ def _list_findings(images: SogImages) -> list[Finding]:
 def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int | None) -> Scene:
     """Open a level of streamed SOG with its environment; blocks are read file by file.
 
-    With `max_splats`, open the finest level of at most this number of splats, else the coarsest.
+    With `max_splats`, the level is the finest of at most this number of splats, else the coarsest. Findings about a
+    file are added to those of the scene when its blocks are first read.
     """
     names, leaves = _read_leaves(parts, meta)
-    last = max([max(leaf) for leaf in leaves], default=0)
-    if level > last:
-        parts.refuse(f"the level is {level}, expected 0 to {last}")
+    coarsest = max([max(leaf) for leaf in leaves], default=0)
+    if level > coarsest:
+        parts.refuse(f"the level is {level}, expected 0 to {coarsest}")
     environment = use_slashes(meta["environment"].text()) if "environment" in meta else None
-    around = 0 if environment is None else read_meta(*parts.nested(environment)).count
+    environment_count = 0 if environment is None else read_meta(*parts.nested(environment)).count
     counts = [
-        around + sum(stop - start for _, start, stop in (_range_at(leaf, lod) for leaf in leaves))
-        for lod in range(last + 1)
+        environment_count + sum(stop - start for _, start, stop in (_range_at(leaf, lod) for leaf in leaves))
+        for lod in range(coarsest + 1)
     ]
     if max_splats is not None:
-        level = next((lod for lod in range(last) if counts[lod] <= max_splats), last)
+        level = next((lod for lod in range(coarsest) if counts[lod] <= max_splats), coarsest)
     findings: list[Finding] = []
     if any("\\" in name for name in names):
         findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
@@ -133,40 +136,44 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
     metas: list[tuple[SogMeta, list[tuple[int, int]]]] = []
     for name, file_ranges in ranges.items():
         sog = read_meta(*parts.nested(name))
-        taken = [(0, sog.count)] if file_ranges is None else file_ranges
-        if taken[-1][1] > sog.count:
-            parts.refuse(f"the level uses splats up to {taken[-1][1]:,} of {name}, which has {sog.count:,}")
-        metas.append((sog, taken))
+        used_ranges = [(0, sog.count)] if file_ranges is None else file_ranges
+        end = used_ranges[-1][1]
+        if end > sog.count:
+            parts.refuse(f"the level uses splats up to {end:,} of {name}, which has {sog.count:,}")
+        metas.append((sog, used_ranges))
     degree = max([read_degree(sog) for sog, _ in metas], default=0)
     metadata = SceneMetadata(
         antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
         flat=bool(metas) and all(sog.flat for sog, _ in metas),
     )
-    seen: set[int] = set()
+    reported: set[int] = set()  # files whose findings are in `findings`: blocks may be read again
 
     def blocks() -> Iterator[SplatModel]:
-        for number, (sog, taken) in enumerate(metas):
+        for number, (sog, used_ranges) in enumerate(metas):
             images = SogImages.of(sog)
-            if number not in seen:
-                seen.add(number)
+            if number not in reported:
+                reported.add(number)
                 findings.extend(_list_findings(images))
             keep = np.zeros(sog.count, bool)
-            for start, stop in taken:
+            for start, stop in used_ranges:
                 keep[start:stop] = True
             at = 0
             for arrays in images.blocks(degree):
                 model = SplatModel(**arrays, metadata=metadata)
-                chosen = keep[at : at + len(model)]
+                in_level = keep[at : at + len(model)]
                 at += len(model)
-                if chosen.any():
-                    yield model if chosen.all() else model.select(chosen)
+                if in_level.any():
+                    yield model if in_level.all() else model.select(in_level)
 
     return Scene(counts[level], degree, blocks, metadata, findings=findings, levels=tuple(counts))
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:
-    """Return the names of the files; and for each leaf of the tree, the range of splats of each level."""
-    if "version" in meta and meta["version"].whole(1 << 30) != 1:
+    """Return the names of the files; and for each leaf with levels, in the order of the tree, the range of each level.
+
+    Refuses another version, and levels or ranges that are no whole numbers within their limits.
+    """
+    if "version" in meta and meta["version"].whole(_MAX_VERSION) != 1:
         parts.refuse(f"it is version {meta['version'].value} of streamed SOG, expected 1")
     names = [item.text() for item in meta["filenames"].list()]
     leaves: list[dict[int, _Range]] = []
@@ -196,20 +203,19 @@ def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
     return leaf[min((lod for lod in leaf if lod >= level), default=max(leaf))]
 
 
-def _collect_ranges(parts: SogParts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
-    """Return the ranges of splats to read by file, in order; refuse overlaps."""
+def _collect_ranges(parts: SogParts, names: list[str], spans: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
+    """Return the ranges (first splat, end) to read by file, ascending, without empty ones; refuse overlaps."""
     ranges_by_file: dict[str, list[tuple[int, int]] | None] = {}
-    before = (-1, 0, 0)
-    for span in sorted(span for span in wanted if span[2] > span[1]):
-        file, start, stop = span
-        if file == before[0] and start < before[2]:
-            parts.refuse(f"the level uses splats {start:,} to {before[2]:,} of {names[file][:80]} twice")
-        if file != before[0] and names[file] in ranges_by_file:
-            parts.refuse(f"filenames contains {names[file][:80]} twice")
+    last_file, last_stop = -1, 0
+    for file, start, stop in sorted(span for span in spans if span[2] > span[1]):
+        if file == last_file and start < last_stop:
+            parts.refuse(f"the level uses splats {start:,} to {last_stop:,} of {names[file][:_SHOWN]} twice")
+        if file != last_file and names[file] in ranges_by_file:
+            parts.refuse(f"filenames contains {names[file][:_SHOWN]} twice")
         ranges = ranges_by_file.setdefault(names[file], [])
         assert ranges is not None, "the environment is added later"
         ranges.append((start, stop))
-        before = span
+        last_file, last_stop = file, stop
     return ranges_by_file
 
 
@@ -261,7 +267,7 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
         OSError: the file cannot be read.
     """
     meta = parts.json(name)
-    version = meta["version"].whole(1 << 30) if "version" in meta else 1
+    version = meta["version"].whole(_MAX_VERSION) if "version" in meta else 1
     if version not in (1, 2):
         parts.refuse(f"it is version {version} of SOG, expected 1 or 2")
     old = version == 1

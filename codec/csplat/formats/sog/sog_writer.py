@@ -32,9 +32,13 @@ _LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
 _LARGEST_SIDE = 16383  # pixels, limit of WebP
 _CODES = 256
 _LLOYD_STEPS = 40
+_BINS = 4096  # of the density that the first codes of a codebook follow
+_AREAS = (0.01, 100.0)  # limits of a splat's area in its weight, relative to the median
 _COARSE = 0.25  # fraction of the range of a codebook beyond which values count as clamped
 _DATE = (1980, 1, 1, 0, 0, 0)  # date of zip members: fixed, so the same scene gives the same bytes
 _NORM = 1000  # lattice steps of a long SH vector; searches are exact up to twice that
+_LONG = 0.999  # quantile of the lengths that counts as long
+_LEAST_STEP = 1e-6  # smallest step of that lattice, so that SH of zeros have one
 _NEAR = 4  # groups of palette entries that are searched, out of 181 for 60,000 splats
 _ITERATIONS = 2  # k-means iterations; more gain 0.03 dB in three times the time
 _LARGEST_PALETTE = 1 << 16
@@ -159,6 +163,7 @@ def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
 
 
 def _signed_logs(means: F32) -> F64:
+    """Return sign(x) log(1 + |x|) of means [N, 3], which SOG quantises."""
     logs: F64 = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     return logs
 
@@ -171,7 +176,7 @@ def _log_area(model: SplatModel) -> F64:
 
 def _splat_weights(model: SplatModel, median_area: float) -> F32:
     """Return weights [N] by the share of a render: opacity times area relative to the scene's median (a logarithm)."""
-    area = np.exp(_log_area(model) - median_area).clip(1e-2, 1e2)
+    area = np.exp(_log_area(model) - median_area).clip(*_AREAS)
     weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
     return weights
 
@@ -200,7 +205,7 @@ def _build_codebook(columns: F32, weights: F32) -> F32:
     mass = np.concatenate([[0.0], np.cumsum(weight)])
     moment = np.concatenate([[0.0], np.cumsum(weight * values)])
     # The optimal density of codes is proportional to the cube root of the density of values (Panter and Dite, 1951).
-    edges = np.linspace(values[0], values[-1], 4097)
+    edges = np.linspace(values[0], values[-1], _BINS + 1)
     density = np.diff(mass[np.searchsorted(values, edges[1:-1])], prepend=0.0, append=mass[-1]) ** (1 / 3)
     share = np.concatenate([[0.0], np.cumsum(density)])
     codes = np.interp((np.arange(_CODES) + 0.5) / _CODES * share[-1], share, edges)
@@ -217,6 +222,7 @@ def _build_codebook(columns: F32, weights: F32) -> F32:
 
 
 def _nearest_codes(codebook: F32, columns: F32) -> U8:
+    """Return the index of the nearest entry of an ascending codebook [256] for each value of `columns`."""
     codes = np.searchsorted((codebook[1:].astype(np.float64) + codebook[:-1]) / 2, columns)
     return codes.astype(np.uint8)
 
@@ -229,7 +235,7 @@ def _build_palette(scene: Scene, sample: SplatModel, weights_of: Callable[[Splat
     """
     coefficients = (scene.sh_degree + 1) ** 2 - 1
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
-    step = np.float32(max(float(np.quantile(lengths, 0.999)) / _NORM, 1e-6))
+    step = np.float32(max(float(np.quantile(lengths, _LONG)) / _NORM, _LEAST_STEP))
     limit = 2 * _NORM / (3 * coefficients) ** 0.5
 
     def points(model: SplatModel) -> NDArray[np.int16]:

@@ -95,12 +95,12 @@ def write_streamed_sog(path: Path, levels: Sequence[Scene]) -> list[Finding]:
     if not levels:
         raise InputError(f"{path}: the scene has no splats, and streamed SOG has no empty leaves")
     tree, leaf_count = _cut_space(levels[0])
-    surveys = [_survey(level, tree, leaf_count) for level in levels]
+    surveys = [_measure_leaves(level, tree, leaf_count) for level in levels]
     filenames, losses = list[str](), SogLosses()
     leaves: list[dict[str, dict[str, int]]] = [{} for _ in range(leaf_count)]
     with atomic_folder(path.parent) as temporary:
         for number, (level, statistics) in enumerate(zip(levels, surveys, strict=True)):
-            _list_runs(leaves, number, statistics, len(filenames))
+            _add_level_of_leaves(leaves, number, statistics, len(filenames))
             names = [f"{number}_{chunk}" for chunk in range(int(statistics.chunks[-1]) + 1)]
             _write_chunks([temporary / name for name in names], level, tree, statistics, losses)
             filenames += [f"{name}/meta.json" for name in names]
@@ -132,7 +132,10 @@ def _check_folder(folder: Path) -> None:
 
 
 def _cut_space(scene: Scene) -> tuple[_Cut | int, int]:
-    """Cut space by medians of a sample of positions; return the tree and the number of leaves."""
+    """Cut space by medians of a sample of positions; return the tree and the number of leaves.
+
+    A cell of more than `_LEAF_SPLATS` splats is cut across the widest axis on which they differ, if there is any.
+    """
     step = -(-scene.count // _SAMPLE)
     sample = np.concatenate([model.means[-rows.start % step :: step] for rows, model in scene.numbered()])
     numbers = count()
@@ -154,7 +157,7 @@ def _cut_space(scene: Scene) -> tuple[_Cut | int, int]:
 
 
 def _number_leaves(tree: _Cut | int, means: F32) -> I64:
-    """Return the leaf of each position [n, 3]."""
+    """Return the number of the leaf, [n], that contains each position [n, 3]."""
     numbers = np.empty(len(means), np.int64)
     pending: list[tuple[_Cut | int, I64]] = [(tree, np.arange(len(means)))]
     while pending:
@@ -167,21 +170,20 @@ def _number_leaves(tree: _Cut | int, means: F32) -> I64:
     return numbers
 
 
-def _survey(scene: Scene, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
+def _measure_leaves(scene: Scene, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
     """Measure the leaves of the tree at a level, and distribute them among chunks; reads all blocks."""
     counts = np.zeros(leaf_count, np.int64)
-    centres, extents = (
-        np.stack([np.full((leaf_count, 3), limit) for limit in (np.inf, -np.inf)], axis=1) for _ in "ce"
-    )
+    centres = np.stack([np.full((leaf_count, 3), np.inf), np.full((leaf_count, 3), -np.inf)], axis=1)
+    extents = centres.copy()
     for model in scene.blocks():
         numbers = _number_leaves(tree, model.means)
         counts += np.bincount(numbers, minlength=leaf_count)
         means, half = model.means.astype(np.float64), _half_extents(model)
         order = np.argsort(numbers, kind="stable")
-        here, starts = np.unique(numbers[order], return_index=True)
+        present, starts = np.unique(numbers[order], return_index=True)  # leaves of this block, and their first splats
         for bounds, least, most in ((centres, means, means), (extents, means - half, means + half)):
-            bounds[here, 0] = np.minimum(bounds[here, 0], np.minimum.reduceat(least[order], starts))
-            bounds[here, 1] = np.maximum(bounds[here, 1], np.maximum.reduceat(most[order], starts))
+            bounds[present, 0] = np.minimum(bounds[present, 0], np.minimum.reduceat(least[order], starts))
+            bounds[present, 1] = np.maximum(bounds[present, 1], np.maximum.reduceat(most[order], starts))
     chunk_count = -(-scene.count // _CHUNK_SPLATS)
     middles = np.cumsum(counts) - (counts + 1) // 2
     _, chunks = np.unique(np.clip(middles * chunk_count // scene.count, 0, chunk_count - 1), return_inverse=True)
@@ -195,19 +197,22 @@ def _half_extents(model: SplatModel) -> F64:
     return half
 
 
-def _list_runs(
+def _add_level_of_leaves(
     leaves: Sequence[dict[str, dict[str, int]]], level: int, statistics: _LevelStatistics, file_count: int
 ) -> None:
-    """Add a level to `lods` of each leaf, also without splats: our reader takes another level for a missing one."""
+    """Add a level to `lods` of each leaf, whose files begin at index `file_count`.
+
+    A leaf without splats gets the level, too: our reader takes another level for a missing one.
+    """
     ends = np.cumsum(statistics.counts)
     firsts = np.searchsorted(statistics.chunks, statistics.chunks)  # the first leaf in the same chunk
-    for leaf, runs in enumerate(leaves):
-        splats = int(statistics.counts[leaf])
-        before = int(ends[firsts[leaf]] - statistics.counts[firsts[leaf]])
-        runs[str(level)] = {
+    for leaf, lods in enumerate(leaves):
+        count = int(statistics.counts[leaf])
+        chunk_start = int(ends[firsts[leaf]] - statistics.counts[firsts[leaf]])
+        lods[str(level)] = {
             "file": file_count + int(statistics.chunks[leaf]),
-            "offset": int(ends[leaf]) - splats - before,
-            "count": splats,
+            "offset": int(ends[leaf]) - count - chunk_start,
+            "count": count,
         }
 
 
@@ -235,13 +240,13 @@ def _write_chunks(
 def _describe_node(
     node: _Cut | int, bounds: F64, leaves: Sequence[dict[str, dict[str, int]]]
 ) -> tuple[dict[str, Any], F64]:
-    """Return the JSON of a node and its bounds, [2, 3]."""
+    """Return the JSON of a node with all below it, and its bounds, [2, 3]; leaves have `bounds` [L, 2, 3]."""
     if isinstance(node, int):
-        box, rest = bounds[node], dict[str, Any](lods=leaves[node])
+        box, content = bounds[node], dict[str, Any](lods=leaves[node])
     else:
         children = [_describe_node(child, bounds, leaves) for child in (node.low, node.high)]
         child_boxes = np.stack([child_box for _, child_box in children])
         box = np.stack([child_boxes[:, 0].min(0), child_boxes[:, 1].max(0)])
-        rest = {"children": [child for child, _ in children]}
+        content = {"children": [child for child, _ in children]}
     least, most = ([float(f"{value:.{_DIGITS}g}") for value in side] for side in box)
-    return {"bound": {"min": least, "max": most}, **rest}, box
+    return {"bound": {"min": least, "max": most}, **content}, box
