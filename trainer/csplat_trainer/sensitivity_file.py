@@ -81,7 +81,7 @@ class StoredSensitivity:
         return np.asarray(self.views > 0, np.bool_)
 
     def importance(self) -> Importance:
-        """Return the importance for the encoder."""
+        """Return the importance for the encoder; splats that no view saw get `_FLOOR` of the median weight."""
         matrices = self.matrices, self.shape_matrices
         return Importance(
             self._apply_floor("colour_squares"), self._apply_floor("shape_squares"), *matrices, self._curvatures()

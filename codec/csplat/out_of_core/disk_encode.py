@@ -81,10 +81,15 @@ class EncodingCost:
 
 
 def working_folder(context: Context, out: str | os.PathLike[str]) -> Path:
-    """Return the path of the working folder of a file; the name of a file of 251 to 255 bytes is shortened."""
+    """Return the working folder of an encoding: `context.folder`, or a folder next to `out` with its name and `.work`.
+
+    A name of more than `_NAME_BYTES_MAX` bytes is cut to `_NAME_PART` characters.
+    """
+    if context.folder is not None:
+        return Path(context.folder)
     path = Path(out)
     name = path.name if len(os.fsencode(path.name)) <= _NAME_BYTES_MAX else path.name[:_NAME_PART]
-    return path.with_name(f"{name}.work") if context.folder is None else Path(context.folder)
+    return path.with_name(f"{name}.work")
 
 
 def estimate_cost(

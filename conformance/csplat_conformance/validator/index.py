@@ -384,8 +384,12 @@ def check_chunk_size(log: ViolationLog, chunk: Chunk) -> Chunk:
 
 
 def read_directory(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Chunk]:
-    """Read the directory records within the index and check DIR-1 to DIR-6."""
-    start, chunks = at, list[Chunk]()
+    """Read the directory records within the index and check DIR-1, DIR-2, DIR-4 to DIR-6, RES-1, CHK-3 and CHK-4.
+
+    Sets `index.end`, and clears `index.complete` if records are cut off.
+    """
+    start = at
+    chunks = list[Chunk]()
     count = index.head.record.directory_count
     size = index.size_of("directory")
     for _ in range(min(count, max(0, (end - at) // size))):
@@ -604,7 +608,10 @@ def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
 
 
 def _read_tile(view: memoryview, at: int, number: int, index: Index, log: ViolationLog) -> Tile:
-    """Read a tile record with its layer records and codebook ids, and check RES-1, RES-2 and TIL-1 to TIL-9."""
+    """Read a tile record with its layer records and codebook ids.
+
+    Checks RES-1, RES-2, and TIL-1 to TIL-9 but TIL-4, which is a permission.
+    """
     placed = read_record(view, _spec.TileRecord, at, f"tile[{number}]")
     log.check_reserved(placed)
     tile = Tile(number, placed)

@@ -117,9 +117,9 @@ def split_views(views: Sequence[TuningView], background: F32, validation_count: 
 def renders_of(
     source: SplatModel, cameras: Sequence[Camera], background: F32, context: Context = DEFAULT_CONTEXT
 ) -> list[TuningView]:
-    """Return renders of a scene as views, the reference for its file without images.
+    """Render a scene as views, which are the reference of a tuning without images.
 
-    There are hundreds, so they are stored in float16: a PSNR of at least 66 dB up to white.
+    Hundreds of renders are kept, so they are stored in float16, whose rounding is below -66 dB for values up to 1.
 
     Args:
         source: the scene.
