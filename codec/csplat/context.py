@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from csplat.sizes import Size, parse_size
 from csplat.system import core_count, default_memory_bytes
 from csplat.types import Progress, null_progress
 
-_LEAST = {"threads": 1, "workers": 1, "seed": 0}
+_LEAST = {"threads": 1, "workers": 1, "seed": 0}  # smallest value of each number; NumPy takes no negative seeds
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,11 @@ class Context:
     def __post_init__(self) -> None:
         for name, least in _LEAST.items():
             value = getattr(self, name)
-            if value is None or (name == "workers" and isinstance(value, str)):
+            if (value is None and name != "seed") or (name == "workers" and isinstance(value, str)):
                 continue
             if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
                 raise InputError(f"{name} is {value!r}, expected an integer of at least {least}")
+            object.__setattr__(self, name, operator.index(value))  # json cannot write NumPy's numbers
         if self.memory is not None:
             object.__setattr__(self, "memory", parse_size(self.memory))
 
@@ -58,7 +60,7 @@ class Context:
 
     @property
     def is_bounded(self) -> bool:
-        """True if memory, workers or the continuation are given, which concern encodings larger than memory."""
+        """True if memory, workers or resume is set; they apply only to encodings that may take place on disk."""
         return self.memory is not None or self.workers is not None or self.resume
 
     @property

@@ -31,7 +31,7 @@ Output = str | os.PathLike[str] | BinaryWriter
 
 
 class Search(Protocol):
-    """Meets a target by rendering; an entry point of `csplat.search`."""
+    """A search that meets a target by rendering; an entry point of `csplat.search`."""
 
     def __call__(
         self,
@@ -177,10 +177,13 @@ def encode_with_report(
             raise InputError("a target and an importance exclude workers, a limit of memory, and resume")
     elif scene.in_memory is None or context.is_bounded:
         path = out if isinstance(out, str | os.PathLike) else None
-        if not estimate_cost(scene, options, context, builder, out=path).in_memory:
+        cost = estimate_cost(scene, options, context, builder, out=path)
+        if not cost.in_memory:
             if path is None:
-                raise InputError("the scene is too large to be encoded in memory, and requires a path as out")
-            return EncodeResult(encode_on_disk(scene, path, options, context, builder))
+                raise InputError(
+                    "the scene is encoded on disk, because it exceeds memory or workers are set: out must be a path"
+                )
+            return EncodeResult(encode_on_disk(scene, path, options, cost, context, builder))
     result = _encode_model(scene.model(), options, target, views, importance, builder, context)
     if out is not None:
         with open_writer(out) as stream:
@@ -199,8 +202,8 @@ def _encode_model(
 ) -> EncodeResult:
     """Encode a model in memory, with or without a target; arguments as in `encode_with_report`.
 
-    A rendered target is met by the installed search. Error bounds are met without levels first. If that took a
-    search, the scene is encoded again with levels and the options that it found; otherwise it has no levels.
+    A rendered target is met by the installed search. Error bounds are met without levels first; the scene is
+    then encoded again with levels and the options found.
     """
     if target is None:
         return encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
@@ -208,10 +211,12 @@ def _encode_model(
         search: Search = _plugin("csplat.search", "target", "search for targets")
         return search(model, options, target=target, views=views, importance=importance, levels=levels, context=context)
     bounded, options = meet_bounds(model, options, target, importance=importance, context=context)
-    if levels is None or bounded.report.search is None:
+    if levels is None:
         return bounded
+    report = bounded.report.search
+    assert report is not None
     result = encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
-    return result.with_search(replace(bounded.report.search, size_bytes=result.size_bytes))
+    return result.with_search(replace(report, size_bytes=result.size_bytes))
 
 
 def encode_planned(

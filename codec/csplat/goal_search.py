@@ -10,9 +10,9 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
-_SLOPES = (0.2, 2.0)  # range of the factor of the model by a second result on the same side of the goal
+_SLOPES = (0.2, 2.0)  # range of the factor by which a second result on the same side of the goal may scale the model
 _EDGE = 0.1  # fraction of an interval between two measured values at whose ends no value is proposed
-_HALVINGS = 50  # of an interval, to invert a model
+_HALVINGS = 50  # bisection steps to invert a model; they exhaust the precision of float64
 
 
 def next_value(

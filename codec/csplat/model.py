@@ -202,7 +202,7 @@ def normalise_quats(quats: NDArray[Any]) -> F32:
 
 
 def _check_array(name: str, array: object, shape: tuple[int | str, ...]) -> None:
-    """Raise an `InputError` unless an array is float32, finite and of a shape, where a string stands for any size."""
+    """Raise an `InputError` unless an array is float32, finite and of the given shape; a string stands for any size."""
     expected = "[" + ", ".join(str(size) for size in shape) + "]"
     if not isinstance(array, np.ndarray):
         raise InputError(f"{name} is a {type(array).__name__}, expected a float32 array {expected}")

@@ -24,15 +24,8 @@ from csplat.types import Progress
 #: Maximum number of splats of a block.
 BLOCK_SPLATS = 65_536
 
-_ABOUT_THE_FILE = {
-    "findings",
-    "format",
-    "levels",
-    "file_axes",
-    "name",
-    "size_bytes",
-    "identity",
-}  # attributes that blocks lack
+#: Attributes that blocks lack.
+_ABOUT_THE_FILE = {"findings", "format", "levels", "file_axes", "name", "size_bytes", "modified_ns"}
 
 
 @dataclass(eq=False)
@@ -55,7 +48,7 @@ class Scene:
         in_memory: the splats, if the scene was made from a model.
         name: name of the file, for messages.
         size_bytes: size of the file; of the tiles, for a coarser version in a .csplat file.
-        identity: what tells the file from other files, JSON-compatible: name, size, time of the last change.
+        modified_ns: time of the last change of the file, nanoseconds; 0 if unknown.
     """
 
     count: int
@@ -72,7 +65,7 @@ class Scene:
     in_memory: SplatModel | None = None
     name: str = ""
     size_bytes: int = 0
-    identity: Mapping[str, Any] = field(default_factory=dict)
+    modified_ns: int = 0
 
     @classmethod
     def of(cls, model: SplatModel) -> Scene:

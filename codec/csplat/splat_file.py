@@ -69,7 +69,7 @@ class SplatFile(Scene):
         self.extra = {column.name: np.dtype(column.dtype) for column in header.extras if column.dtype is not None}
         self.reader, self.has_doubles, self.file_axes = self.models, False, ""
         self.format, self.name, self.size_bytes = "csplat", store.name, store.size
-        self.findings, self.in_memory, self.identity = [], None, {}
+        self.findings, self.in_memory, self.modified_ns = [], None, 0
         if header.coarse_tiles:
             self.findings.append(_levels_finding(header, "level 0 alone is read"))
 
@@ -384,7 +384,7 @@ class SplatFile(Scene):
 
 
 def _levels_finding(header: SceneHeader, which: str) -> Finding:
-    """Report that a file has coarser levels; `which` describes the one that is read."""
+    """Report that a file has coarser levels; `which` describes the version that is read."""
     last = max(tile.level for tile in header.coarse_tiles)
     return Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")
 

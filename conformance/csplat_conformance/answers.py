@@ -221,7 +221,7 @@ def whole_number(text: str) -> float:
 
 
 def _compare_header(expect: Mapping[str, Any], header: Mapping[str, Any]) -> tuple[Status, str]:
-    """Compare the fields of `expect` with those of a header, which may have more; flags in any order."""
+    """Compare the fields of `expect` with a header, which may have more fields; flags may be in any order."""
     if not header:
         return Status.WRONG_ANSWER, "no header.json"
     wrong = []

@@ -130,7 +130,7 @@ def _levels(report: ConformanceReport) -> list[str]:
 
 
 def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, int]:
-    """Count outcomes: all checks, the good ones by status (`extra` must list those of the suite), and failures."""
+    """Count all checks, good checks by status (`extra` lists the suite's additional statuses), and failures."""
     counts = dict.fromkeys(("checks", "passed", *map(str, extra), "failed", "skipped"), 0)
     for outcome in outcomes:
         counts["checks"] += 1
@@ -238,7 +238,7 @@ def _junit_totals(outcomes: Sequence[Outcome]) -> str:
 
 
 def _junit_case(outcome: Outcome, suite: str) -> str:
-    """Return the XML of a test case: warnings as its output, unchecked ones as skipped."""
+    """Return the XML of a test case: warnings as its output, unchecked cases as skipped."""
     head = f'    <testcase classname="{_xml(suite)}" name="{_xml(outcome.name)}" time="{outcome.seconds:.3f}"'
     if outcome.status is Status.PASSED:
         return head + "/>"

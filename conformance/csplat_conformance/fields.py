@@ -126,7 +126,7 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
 def _split_format(packed: str, offsets: dict[str, int]) -> dict[str, tuple[int, str]]:
     """Split a struct format at the offsets of the fields; return offset and format of each field by name.
 
-    A field has all codes up to the offset of the next one. The first field is at offset 0.
+    A field has all codes up to the offset of the next field. The first field is at offset 0.
     """
     codes = re.findall(r"\d*[a-zA-Z]", packed.lstrip("<"))
     result: dict[str, tuple[int, str]] = {}

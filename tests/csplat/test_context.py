@@ -1,15 +1,16 @@
 """The context of work: its ranges and defaults."""
 
-import os
-
 import numpy as np
 import pytest
 
-from csplat import Context, InputError
+from csplat import Context, InputError, encode
 from csplat.context import DEFAULT_CONTEXT
+from csplat.system import core_count
 
 
-@pytest.mark.parametrize("field", [{"threads": 0}, {"threads": 1.5}, {"workers": 0}, {"seed": -1}, {"seed": True}])
+@pytest.mark.parametrize(
+    "field", [{"threads": 0}, {"threads": 1.5}, {"workers": 0}, {"seed": -1}, {"seed": True}, {"seed": None}]
+)
 def test_a_number_out_of_range_is_refused(field):
     with pytest.raises(InputError, match=f"^{next(iter(field))} is .*, expected an integer of at least"):
         Context(**field)
@@ -17,7 +18,7 @@ def test_a_number_out_of_range_is_refused(field):
 
 def test_the_default_uses_all_cores_and_half_of_the_free_memory(monkeypatch):
     monkeypatch.setattr("csplat.system.available_memory_bytes", lambda: 1000)
-    assert 1 <= DEFAULT_CONTEXT.thread_count <= os.cpu_count()
+    assert core_count() == DEFAULT_CONTEXT.thread_count
     assert (3, 500) == (Context(threads=np.int64(3)).thread_count, DEFAULT_CONTEXT.memory_limit)
     assert 7000 == Context(memory="7 kB").memory_limit
 
@@ -32,3 +33,9 @@ def test_memory_workers_and_resuming_concern_encodings_on_disk():
             Context(resume=True),
         )
     ]
+
+
+def test_numbers_of_numpy_become_pythons(make_model):
+    context = Context(threads=np.int64(2), seed=np.int64(3))
+    assert (int, int) == (type(context.threads), type(context.seed))
+    assert encode(make_model(50, 0), context=Context(seed=3)) == encode(make_model(50, 0), context=context)

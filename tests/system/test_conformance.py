@@ -1,4 +1,4 @@
-"""Tests of system.conformance.
+"""`csplat conformance`: reports for people, programs and CI.
 
 Also: csplat_tools.cli.conformance.
 """

@@ -1,4 +1,4 @@
-"""Tests of system.editing.
+"""`csplat extract` and `csplat merge`, as users run them.
 
 Also: csplat_tools.cli.extract, csplat_tools.cli.merge.
 """

@@ -1,4 +1,4 @@
-"""Tests of system.encode.
+"""`csplat encode`: reports, streams, refusals and options.
 
 Also: csplat_tools.cli.command_output, csplat_tools.cli.encode, csplat_tools.cli.shared_options,
 csplat_tools.encode_file, csplat_tools.file_streams.
@@ -25,6 +25,7 @@ import pytest
 from command_line import PROGRAM, invoke, printed, refused, status_of
 from typer.main import get_command
 
+import csplat
 from csplat import Context, decode, write_ply
 from csplat.ply import read_ply
 from csplat_tools.cli.app import app
@@ -435,6 +436,13 @@ def test_numbers_of_any_length_are_refused(ply, tmp_path):
     for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
         for digits in ("9" * 5000, "9" * 400 + "M", "١", "²"):
             refused(*words, digits, status=2)
+
+
+def test_an_open_scene_is_encoded_to_a_target(ply, tmp_path):
+    target = csplat.Target(max_error={"means": 1e-4})
+    with csplat.open(ply) as scene:
+        encoded = encode_file(scene, str(tmp_path / "out.csplat"), csplat.EncodeOptions(), target=target)
+    assert encoded.result.report.search.reached["means"] <= 1e-4
 
 
 def test_the_command_passes_threads_memory_and_the_continuation(ply, tmp_path, monkeypatch):

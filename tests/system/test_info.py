@@ -1,7 +1,6 @@
-"""Tests of system.info.
+"""`csplat info`: every byte is accounted for, as text and JSON.
 
-Also: csplat_tools.cli.error_lines, csplat_tools.cli.info, csplat_tools.inspect.file_description,
-csplat_tools.inspect.text_reports.
+Also: csplat_tools.cli.error_lines, csplat_tools.cli.info, csplat_tools.inspect.text_reports.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Tests of system.verify.
+"""`csplat verify`: violations by clause, and declared errors against a source.
 
 Also: csplat_tools.cli.verify, csplat_tools.inspect.verification.
 """

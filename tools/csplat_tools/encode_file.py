@@ -12,9 +12,11 @@ from typing import Any
 import csplat
 from csplat._spec import MEASURE_NAMES
 from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.disk_files import size_on_disk
 from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, EncodeResult, Target, Views
 from csplat.errors import InputError, counted
+from csplat.formats import detect_format
 from csplat.model import MAX_SH_DEGREE
 from csplat.out_of_core import EncodingCost, estimate_cost, working_folder
 from csplat.scene import Scene
@@ -23,6 +25,7 @@ from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array,
 from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_levels, read_streamed_levels
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_source
 
+_PLY_FACTOR = 8  # memory of an encoding divided by the size of its PLY, at most; 3 for float32 columns, more for bytes
 _MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
 
 
@@ -139,19 +142,26 @@ def encode_file(
     start = time.perf_counter()
     with ExitStack() as stack:
         if isinstance(source, Scene):
-            scene, builder = source, choose_levels(source.count, options, levels)
+            scene = source.loaded() if whole else source
+            builder = choose_levels(scene.count, options, levels)
         else:
             local = stack.enter_context(source_path(source))
-            context.progress("opening", 0.0)
-            opened = stack.enter_context(csplat.open(local, format, sh_degree=read_degree(options)))
-            builder = choose_levels(opened.count, options, levels)
-            if builder is not None and opened.format == "sog" and len(opened.levels) > 1 and not (target or importance):
-                builder, whole = _levels_of_source(local, builder, context), True
-            in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
-            scene = read_source(
-                local, overrides, format=format, strict=strict, keep_extra=options.keep_extra,
-                sh_degree=read_degree(options), opened=opened, in_memory=in_memory, progress=context.progress,
-            )  # fmt: skip
+            reading: dict[str, Any] = {
+                "format": format, "strict": strict, "keep_extra": options.keep_extra, "sh_degree": read_degree(options),
+                "progress": context.progress,
+            }  # fmt: skip
+            if levels is None and (whole or _surely_fits(local, format, context)):
+                scene, builder = read_source(local, overrides, **reading), None
+            else:
+                context.progress("opening", 0.0)
+                opened = stack.enter_context(csplat.open(local, format, sh_degree=read_degree(options)))
+                context.progress("opening", 1.0)
+                builder = choose_levels(opened.count, options, levels)
+                has_levels = opened.format == "sog" and len(opened.levels) > 1
+                if builder is not None and has_levels and not (target or importance):
+                    builder, whole = _levels_of_source(local, builder, context), True
+                in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
+                scene = read_source(local, overrides, opened=opened, in_memory=in_memory, **reading)
         if scene.in_memory is None:
             result = _encode_on_disk(scene, output, options, builder, context)
         elif importance is not None:
@@ -171,6 +181,13 @@ def encode_file(
         if source_index is not None:
             write_array(source_index, result.source_index)
     return EncodedFile(scene, result, time.perf_counter() - start)
+
+
+def _surely_fits(path: Path, format: str | None, context: Context) -> bool:
+    """Return True if a PLY fits in memory for certain, so that it need not be surveyed before it is read."""
+    if context.is_bounded or detect_format(path, format).name != "ply":
+        return False
+    return _PLY_FACTOR * size_on_disk(path) <= context.memory_limit
 
 
 def _levels_of_source(local: Path, builder: FittedLevelBuilder, context: Context) -> FittedLevelBuilder:

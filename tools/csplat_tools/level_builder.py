@@ -198,7 +198,7 @@ class FittedLevelBuilder:
             fit: makes the splats of a level from the next finer level, as `LevelFitter.fit`.
             last: the coarsest level; `None`: the first level with a single node of at most `root_splats`.
         """
-        nodes, node_count = list(nodes), len(nodes)  # node_count: of the coarsest level so far
+        nodes, node_count = list(nodes), len(nodes)  # node_count counts the coarsest level so far
         level = first = nodes[0].level
         while (node_count > 1 or len(splats) > self.root_splats) if last is None else level < last:
             level += 1

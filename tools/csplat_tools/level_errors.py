@@ -136,9 +136,9 @@ def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
 def _least_alike_size(squares: F64, radius: float) -> float:
     """Return the smallest pixel size, scene units, from which on all squared errors, [_SIZES], are small, as float32.
 
-    If none is small at the coarsest size, that is the next coarser one.
+    If the error at the coarsest size is not small, return the next coarser size.
     """
-    # The number of small errors at the coarse end: the index of the first False, after which one always follows.
+    # Number of small errors at the coarse end: the index of the first False, which is appended if all are small.
     alike_count = int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
     first = _SIZES - alike_count
     return float(np.float32(radius * 2.0**first / _RADIUS_PIXELS))

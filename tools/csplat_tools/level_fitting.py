@@ -15,7 +15,7 @@ import numpy as np
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import LimitError
 from csplat.model import SplatModel
-from csplat.types import I64
+from csplat.types import I64, null_progress
 from csplat_render.camera import Camera
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.level_merging import light_of, merge_neighbours
@@ -104,7 +104,7 @@ class LevelFitter:
         draw = renderer(self.scene, (0.0, 0.0, 0.0), context=self.context)
         renders = [draw(camera).rgb for camera in used]
         fitted = refit_splats(chosen, used, renders, steps=steps, moves=True, context=self.context)
-        scorer = Scorer.of_source(self.scene, check, context=self.context)
+        scorer = Scorer.of_source(self.scene, check, context=replace(self.context, progress=null_progress))
         return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
 
     def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:

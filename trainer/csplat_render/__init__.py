@@ -133,5 +133,5 @@ def _find_device(backend: Backend) -> Device | None:
 
     device, reason = find_device(backend)
     if reason:
-        warnings.warn(f"{reason}: rendering on the CPU", stacklevel=3)  # of the caller of `render`
+        warnings.warn(f"{reason}: rendering on the CPU", stacklevel=3)  # names the line that called `render`
     return device

@@ -43,7 +43,7 @@ _GOOD = 0.85  # detail from which a view is worth showing, as a fraction of the 
 _ARC_MIN = 10.0  # degrees in each direction
 
 _SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees in each direction from a known view; the widest is tried first
-_SWING_CHECKS = 8  # number of views per swing whose detail is checked; the last repeats the first
+_SWING_CHECKS = 7  # number of views per swing whose detail is checked
 _FLATTENED = 0.3  # ratio of the vertical to the horizontal swing
 _NEAREST_MIDDLE = 0.3  # extents; minimum distance of the look-at point from a view
 
@@ -193,7 +193,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
     middle, side, near = eye + depth * ahead, first.viewmat[0, :3], min(frame.near, first.near)
 
     def swung(width_degrees: float, turn: float) -> Camera:
-        """Return the camera at an angle `turn`, radians, on an ellipse; at a width of 0, where the known one is."""
+        """Return the camera at an angle `turn`, radians, on an ellipse; at a width of 0, the known camera."""
         aside = math.radians(width_degrees) * math.sin(turn)
         above = math.radians(width_degrees) * _FLATTENED * math.cos(turn)
         way = -ahead + math.tan(aside) * side + math.tan(above) * frame.up
@@ -203,7 +203,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
     turns = 2.0 * math.pi * np.arange(count) / count
     nearest = HIDING * depth
     good = _GOOD * detail(cloud, swung(0.0, 0.0), nearest)
-    checks = np.linspace(0.0, 2.0 * math.pi, _SWING_CHECKS)
+    checks = np.linspace(0.0, 2.0 * math.pi, _SWING_CHECKS, endpoint=False)
     for swing in _SWINGS:
         if min(detail(cloud, swung(swing, turn), nearest) for turn in checks) >= good:
             break
@@ -213,7 +213,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
     """Return a path inside surroundings, on the arc with the greatest surplus of detail.
 
-    The surplus is the sum over azimuths of the detail minus `_GOOD` times that of the best view. The path swings along
+    The surplus is the sum over azimuths of the detail minus `_GOOD` times the best view's detail. The path swings along
     the arc and back, or goes round if the arc is a full circle.
 
     Returns:
@@ -238,7 +238,7 @@ def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float
 
 
 def _best_arc(gains: F64) -> tuple[int, int, int]:
-    """Return row, first column and length of the run with the largest sum, at least one long; rows are cyclic."""
+    """Return row, first column and length of the run of at least one column with the largest sum; rows are cyclic."""
     turns = gains.shape[1]
     most, best = -math.inf, (0, 0, 1)
     for row, gain in enumerate(gains):

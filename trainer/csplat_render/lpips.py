@@ -227,7 +227,7 @@ def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
 
 
 def _normalise_channels(x: F32) -> NDArray[np.float64]:
-    """Return features [h, w, channels] in float64, those of each pixel scaled to length 1; 0 stays 0."""
+    """Return features [h, w, channels] in float64, with each pixel's features scaled to length 1; 0 stays 0."""
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result

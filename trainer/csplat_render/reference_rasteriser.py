@@ -169,7 +169,7 @@ def _unit_quats(quats: Array) -> Array:
 def _clamp_tangent(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
     """Clamp tangents x/z or y/z, [n], to the image plus `FOV_MARGIN`; the perspective is linearised there.
 
-    Focal length, centre and size of the image are those of the axis, in pixels. `decisions` records both comparisons.
+    Focal length, centre and size are measured along the axis, in pixels. `decisions` records both comparisons.
     """
     margin = FOV_MARGIN * 0.5 * size / focal
     low, high = -centre / focal - margin, (size - centre) / focal + margin

@@ -66,7 +66,7 @@ class Scorer:
         references: the reference image of each view, or a function that returns it on demand.
         background: red, green, blue of the background.
         mode: mode of the renderer.
-        context: threads.
+        context: threads; and progress, which a scene that is not in memory reports during each render.
         origin: origin of the camera coordinates; `None`: the origin of the scored scene.
         pixels: number of pixels to compare in each view; `None`: all pixels.
 
@@ -211,7 +211,7 @@ def renderer(
         model: the scene. Cameras are relative to its origin.
         background: red, green, blue of the background.
         mode: `exact`, `standard` or `fast`.
-        context: threads.
+        context: threads; and progress, which a scene that is not in memory reports during each render.
     """
     if not isinstance(model, SplatModel):
         return model.renderer(background, mode=mode, context=context)

@@ -89,7 +89,7 @@ class Fitter:
         self._window: list[LossValue] = []
         self._pending: list[PendingLoss] = []
         self._begin = time.perf_counter()
-        self._steps_before, self._seconds_before = 0, 0.0  # of the run that a checkpoint continues
+        self._steps_before, self._seconds_before = 0, 0.0  # steps and seconds of the run that a checkpoint continues
 
     def resume(self, checkpoint: FitCheckpoint) -> None:
         """Continue from a checkpoint.

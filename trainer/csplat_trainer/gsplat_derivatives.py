@@ -32,9 +32,9 @@ from csplat_trainer.sensitivity import Sensitivity
 
 _DRAWS = 2  # random images per view
 _LARGEST_ALPHA = 0.998  # gsplat stops at 0.999
-_SEED = 0  # of the random images
+_SEED = 0  # seed of the random images
 _SHORTEST = 1e-12  # least length to divide by
-_TRIANGLE = torch.triu_indices(6, 6)  # of a matrix over `_ENTRIES`
+_TRIANGLE = torch.triu_indices(6, 6)  # indices of the upper triangle of a matrix over `_ENTRIES`
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, yz of a covariance
 
 

@@ -280,7 +280,7 @@ def photometric_loss_twin(
 # pyright: reportMissingImports=false
 
 
-_STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)  # of AlexNet's five convolutions
+_STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)  # pixels; stride and padding of AlexNet's five convolutions
 _POOLED = (1, 2)  # indices of layers after a 3×3 pooling of stride 2
 _LPIPS_EPSILON = 1e-10  # added to the squared length, so that the gradient of a zero vector is finite
 

@@ -162,7 +162,7 @@ def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> No
         for c in range(pixels.shape[1]):
             if pixels.shape[2] == 4:
                 alpha = np.float32(pixels[r, c, 3]) * over
-                share = np.float32(1.0) - alpha  # of the background
+                share = np.float32(1.0) - alpha  # weight of the background
                 for k in range(3):
                     out[r, c, k] = alpha * (np.float32(pixels[r, c, k]) * over) + share * background[k]
             else:

@@ -384,7 +384,7 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
 def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
     """Sum over the pixels of a tile for one splat: the equations at the top of this module, with h = (u, v, w).
 
-    The first pass over the pixels computes all sums but those of t tᵀ, the second pass these.
+    The second pass over the pixels computes the sums of t tᵀ, the first pass all others.
 
     Args:
         body: planes of the tile, from the first pixel of the splat on.

@@ -160,7 +160,7 @@ class _Refit:
 
     def __init__(self, views: _TrainingViews, steps: int, context: Context) -> None:
         self._views, self._context = views, context
-        self._length = 0.0  # of the first steps, set by `run`
+        self._length = 0.0  # length of the first steps, set by `run`
         self._fitter = Fitter(len(views), steps, context.seed)
         passes = [self._fitter.rng.permutation(len(views)) for _ in range(-(-steps // len(views)))]
         self._fitter.queue = np.concatenate(passes)[:steps][::-1].tolist()  # the last is the next

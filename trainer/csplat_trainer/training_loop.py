@@ -20,6 +20,7 @@ from csplat.model import SplatModel
 from csplat.scene_metadata import TRAINING, VIEW
 from csplat.types import F32, I64
 from csplat_render.camera import Camera, central_camera
+from csplat_render.kernels import thread_count
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
@@ -82,7 +83,8 @@ def train(
             on_step(now)
 
     images = data if isinstance(data, DataSet) else load(data)
-    return _Training(images, options or TrainOptions(), outputs or Outputs(), show, context).run()
+    with thread_count(context.threads):
+        return _Training(images, options or TrainOptions(), outputs or Outputs(), show, context).run()
 
 
 class _Training:

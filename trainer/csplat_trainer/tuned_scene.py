@@ -102,7 +102,7 @@ class TunedScene:
         self.fixed.constrain(self._free_values(alphas))
 
     def _by_row(self, by_splat: F32) -> F32:
-        """Return the gradients of the file's rows of SH, [R, K, 3], given those of all splats [N, K, 3].
+        """Return the gradients of the file's rows of SH, [R, K, 3], given the gradients of all splats [N, K, 3].
 
         With a codebook, rows are its entries, then the escaped splats, and the next call overwrites the result.
         Without, rows are splats.
@@ -199,7 +199,7 @@ def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
 MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
 _ROWS = 1 << 15  # rows of SH to count at a time; their integers take several times the memory of the values
 _MAX_SLOPE = 4.0  # bits per step; frequencies of rare integers are too uncertain for larger slopes
-_FRACTION_MIN = 1e-12  # for the logarithm of frequencies of 0, which count 0 times
+_FRACTION_MIN = 1e-12  # fraction; avoids log(0), whose weight is 0
 _INTEGER_LIMIT = 2.0**30  # fits int32
 _ROOT2 = np.sqrt(2.0)
 

@@ -235,7 +235,7 @@ def iter_tiles(
         limits: as in `decode`; `limits.bytes` applies to each tile.
         tiles: as in `decode`.
         sh_degree: as in `decode`.
-        context: threads, each for a tile.
+        context: number of threads; each decodes one tile at a time.
     """
     return request_tiles(_request_of(data, limits, tiles, sh_degree), context)
 

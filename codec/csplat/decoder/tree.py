@@ -217,7 +217,7 @@ def _cut_where(nodes: Sequence[Node], is_replaced: Callable[[int], bool]) -> lis
 
 
 def _at_pixel_size(nodes: Sequence[Node], pixel_size: float | Sequence[float]) -> list[int]:
-    """Return the first node from each root whose error is at most a size of pixels, ascending.
+    """Return the first node on each path from a root whose error is at most its pixel size, ascending.
 
     Args:
         nodes: all nodes.

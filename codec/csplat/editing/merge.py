@@ -325,7 +325,7 @@ def _merge_scenes(scenes: Sequence[SplatFile]) -> Scene:
 def _merged_blocks(scenes: Sequence[SplatFile], empty: SplatModel) -> Iterator[SplatModel]:
     """Yield the tiles of all files as models like `empty`.
 
-    Means are relative to the common origin, missing SH bands are 0, and extra columns are those of `empty`.
+    Means are relative to the common origin, missing SH bands are 0, and only the extra columns of `empty` are kept.
     """
     for scene in scenes:
         for tile in scene.tiles():

@@ -16,7 +16,7 @@ from csplat.encoder.entropy import DeflateSettings, unsigned_stream
 from csplat.errors import InputError
 
 _CRC_SIZE = 4  # bytes
-_CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
+CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 #: Chunks that no renderer needs, which are last in a file with levels of detail.
 _LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 
@@ -243,7 +243,7 @@ def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
         + sum(
             _spec.TILE_RECORD_SIZE
             + len(tile.layers) * _spec.LAYER_RECORD_SIZE
-            + len(tile.codebook_ids) * _CODEBOOK_ID_SIZE
+            + len(tile.codebook_ids) * CODEBOOK_ID_SIZE
             for tile in tiles
         )
         + _CRC_SIZE
@@ -309,7 +309,7 @@ def _index(
             )
         )
         parts += [_spec.pack_layer_record(layers[number, layer]) for layer in sorted(tile.layers)]
-        parts += [identity.to_bytes(_CODEBOOK_ID_SIZE, "little") for identity in tile.codebook_ids]
+        parts += [identity.to_bytes(CODEBOOK_ID_SIZE, "little") for identity in tile.codebook_ids]
     index = b"".join(parts)
     return index + zlib.crc32(index).to_bytes(_CRC_SIZE, "little")
 

@@ -23,12 +23,12 @@ from csplat.model import SplatModel
 
 _TRIES = 8  # largest number of steps of a measure
 _COARSENESS = (-20.0, 20.0)  # range of the logarithm of the factor by which steps may differ from the first
-# Logarithms of an error relative to its bound: what new steps aim at, and errors that are near enough.
+# Logarithms of the ratio of bound to error: new steps aim at the margin; a ratio within the tolerance ends the search.
 _MARGIN, _TOLERANCE = 0.03, 0.1
 _LARGEST_STEP, _LEAST_STEP = 2.0, 0.02  # logarithm of the factor from one step to the next
 _SCALE_STEP_RATIO = 0.4  # first scale step, log scale, relative to the bound of the covariance; the search corrects it
 _QUAT_LEVELS_RATIO = 4.0  # first rotation levels, times that bound
-_QUAT_LEVELS_MIN = 8  # rotation levels
+_QUAT_LEVELS_MIN = 8  # smallest number of rotation levels that the search tries
 _STEP_MIN, _STEP_MAX = 1e-6, 1e3  # range of the steps that `EncodeOptions` accepts
 _KNOBS = {  # options that set the steps of a family of measures
     "means": ("position_error", "position_step", "position_bits"),
@@ -63,7 +63,8 @@ def meet_bounds(
     Raises:
         InputError: `encoding` sets a step that a bound determines, or no step is fine enough.
     """
-    start, bounds, files = time.perf_counter(), target.max_error, dict[EncodeOptions, EncodeResult]()
+    start, bounds = time.perf_counter(), target.max_error
+    tried = dict[EncodeOptions, dict[str, float]]()  # largest errors relative to their bounds
     # By family of measures: log of the bounds that steps are chosen for, relative to `bounds`; and for each such value
     # the log of the largest error relative to its bound.
     coarseness = {_family(name): 0.0 for name in bounds}
@@ -73,13 +74,14 @@ def meet_bounds(
         options = _options_for(
             source, encoding, {name: bound * math.exp(coarseness[_family(name)]) for name, bound in bounds.items()}
         )
-        if options not in files:
+        if options not in tried:
             plan = EncodePlan.of(source, options, importance=importance, context=context)
-            files[options] = encode_tiles(plan).write()
-        result = files[options]
-        ratios = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
-        if max(ratios.values()) <= 1.0 and (best is None or result.size_bytes < best[0].size_bytes):
-            best = result, options
+            result = encode_tiles(plan).write()
+            tried[options] = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
+            is_met = max(tried[options].values()) <= 1.0
+            if is_met and (best is None or result.size_bytes < best[0].size_bytes):
+                best = result, options
+        ratios = tried[options]
         adjusted = dict[str, float]()
         for family, excesses in measured.items():
             ratio = max(ratio for name, ratio in ratios.items() if _family(name) == family)
@@ -98,7 +100,7 @@ def meet_bounds(
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
             f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best found is"
-            f" {result.largest_error(worst):.3g}; allow a larger error"
+            f" {ratios[worst] * bounds[worst]:.3g}; allow a larger error"
         )
     result, options = best
     search = SearchReport(
@@ -106,7 +108,7 @@ def meet_bounds(
         size_bytes=result.size_bytes,
         splats=result.report.splat_count,
         splats_before=len(source),
-        encodes=len(files),
+        encodes=len(tried),
         seconds=round(time.perf_counter() - start, 3),
         reached={name: result.largest_error(name) for name in bounds},
     )

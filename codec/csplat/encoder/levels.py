@@ -46,7 +46,7 @@ class LevelNode:
 
 
 class LevelBuilder(Protocol):
-    """Builds levels of detail, and measures their errors; picklable. Of a context, they use threads and progress."""
+    """A builder of levels of detail, which also measures their errors; picklable."""
 
     @property
     def whole_splats(self) -> int:

@@ -19,7 +19,7 @@ from csplat import _spec
 from csplat.context import Context
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, StepFactors
-from csplat.encoder.container import FileChunk, IndexedCodebook
+from csplat.encoder.container import CODEBOOK_ID_SIZE, FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, signed_stream
 from csplat.encoder.error_bounds import covariance_entries
@@ -47,7 +47,6 @@ _ESCAPES = 0.05  # fraction of the splats to escape if the importance has no met
 _OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # each entry off the diagonal occurs twice
 _DIMENSIONS = 6  # dimensions of a shape: an additional bit per splat divides the squared error by 2**(2/6)
 _STEPS_MAX = 2.0**20  # steps of the log scales, above which a tile's lattice may be coarser than the file's
-_CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 _OVERHEAD = 128  # bytes of records, heads and checksums of a codebook
 _FLATTEST = 1e-30  # smallest variance as a fraction of the trace; rounding may leave an eigenvalue at 0 or below
 _THINNEST = 20.0  # log scales by which an axis of an entry is at most smaller than the largest
@@ -154,11 +153,11 @@ def choose_shapes(
     if fraction is None and metric is None:
         fraction = _ESCAPES
     training = shapes.weights * shapes.fits
-    steps = replace(context, progress=null_progress)  # of each round
+    quiet = replace(context, progress=null_progress)  # k-means would report a stage of its own
     codebook: ShapeCodebook | None = None
     for step in range(_ROUNDS):
         context.progress("shapes", step / _ROUNDS)
-        entries, index = _train_entries(shapes, training, size, parameters, steps)
+        entries, index = _train_entries(shapes, training, size, parameters, quiet)
         errors, summand = _assignment_errors(shapes, entries, index, parameters)
         if fraction is None:
             assigned = _worth_assigning(shapes, errors, index, summand)
@@ -485,7 +484,7 @@ def _keep_where_smaller(
         gain = -1  # bytes; escapes the tile
         if plain.exponent == 0:
             assigned = quantise_shape(quats, scales, parameters, part)
-            gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - _CODEBOOK_ID_SIZE
+            gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - CODEBOOK_ID_SIZE
         if gain > 0:
             saved += gain
         else:

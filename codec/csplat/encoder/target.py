@@ -134,7 +134,7 @@ def _file_size(size: Size) -> int:
     """Return the number of bytes of a size; a bare number smaller than every file lacks its unit."""
     count = parse_size(size)
     if count <= HEADER_SIZE:
-        raise InputError(f"no file has {count} bytes or fewer; did you mean {str(size).strip()}MB?")
+        raise InputError(f"no file has {count} bytes or fewer; expected a larger size, such as 5MB")
     return count
 
 

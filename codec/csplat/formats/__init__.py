@@ -195,7 +195,7 @@ def open(
         scene = _version_of(file_format, scene, path.name, level, max_splats, sh_degree)
         if not scene.format:
             scene = scene.changed(format=file_format.name, name=path.name, size_bytes=size_on_disk(path))
-        scene.identity = {"name": path.name, "size": scene.size_bytes, "changed": path.stat().st_mtime_ns}
+        scene.modified_ns = path.stat().st_mtime_ns
         return scene.keep_open(stack.pop_all())  # which closes a `SplatFile` itself a second time, without effect
 
 

@@ -37,7 +37,7 @@ from csplat.types import F32, U8, U32
 _CHUNK = 256  # splats that share bounds
 _LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger scale would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
-_COUNT_DIGITS = 18  # of a row count: it fits in 64 bits
+_COUNT_DIGITS = 18  # most digits of a row count, which then fits in 64 bits
 _BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
@@ -157,7 +157,7 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     declared: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments: list[str] = []
-    form = ""  # of the line "format"
+    form = ""  # format named in the header
     for line in lines[1:]:
         words = line.split()
         if words[:1] == ["comment"]:

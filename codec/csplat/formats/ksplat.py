@@ -30,7 +30,7 @@ Rows = NDArray[Any]
 
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
-_HEADER_SIZE, _SECTION_SIZE = 4096, 1024  # bytes; the headers of all sections follow that of the file
+_HEADER_SIZE, _SECTION_SIZE = 4096, 1024  # bytes; the section headers follow the file header
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
 _COEFFICIENTS = (0, 9, 24)  # number of SH coefficients, by degree
 _CENTRE_SIZE = 12  # bytes of a bucket's centre, three float32

@@ -340,7 +340,7 @@ def _decode_first_three(rotations: U8) -> F32:
 
 
 def _decode_rotations(rotations: U8) -> F32:
-    """Decode [N, 4] bytes to wxyz: three smallest in ten bits each, sign and magnitude, the first in the highest."""
+    """Decode [N, 4] bytes to wxyz: the three smallest components have ten bits each, the first the highest."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
     sizes = fields & _MAGNITUDE_MAX

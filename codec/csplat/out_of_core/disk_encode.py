@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -163,6 +163,7 @@ def encode_on_disk(
     scene: Scene,
     out: str | os.PathLike[str],
     options: EncodeOptions,
+    cost: EncodingCost,
     context: Context = DEFAULT_CONTEXT,
     levels: LevelBuilder | None = None,
 ) -> EncodeReport:
@@ -172,7 +173,8 @@ def encode_on_disk(
         scene: the scene.
         out: path of the file, which appears when complete.
         options: options of the encoder.
-        context: threads, workers, memory, working folder, whether to resume, seed and progress.
+        cost: the estimate for these arguments, with the number of workers and the space on the disk.
+        context: threads, workers, working folder, whether to resume, seed and progress.
         levels: builds levels of detail; `None`: the file has none.
 
     Returns:
@@ -181,10 +183,9 @@ def encode_on_disk(
     Raises:
         CsplatError, OSError: as in `csplat.encode`.
     """
-    cost = estimate_cost(scene, options, context, levels, out=out)
     settings = {} if levels is None else {"levels": levels.settings(scene.count)}
     key = {
-        "source": dict(scene.identity),
+        "source": {"name": PurePath(scene.name).name, "size": scene.size_bytes, "changed": scene.modified_ns},
         "options": {**options.chosen(), "seed": context.seed},
         "splats": scene.count,
         "csplat": __version__,

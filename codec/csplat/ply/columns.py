@@ -54,7 +54,7 @@ _FEW = 16  # splats; a property that fewer have in common may be coincidence
 _TINY = 1e-30  # smallest divisor
 _ROUNDING = 1e-3  # tolerance by which alphas may exceed 0 and 1
 _SAMPLE_OF_BLOCK = 256  # splats per block whose scales are compared with the scene's extent
-_EXTENT_QUANTILES = (0.95, 0.05)  # of means, whose difference is the extent of a scene without outliers
+_EXTENT_QUANTILES = (0.95, 0.05)  # quantiles of the means; their difference is the extent of a scene without outliers
 _LENGTHS_RATIO = 3.0  # minimum ratio of the 95th to the 5th percentile of scales that are lengths
 _BYTE_COLOUR = 4.0  # a larger f_dc is much brighter than white (1.77) and may be a colour of 0 to 255
 

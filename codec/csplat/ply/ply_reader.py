@@ -241,7 +241,7 @@ def _packed_colours(path: Path, header: PlyHeader, declared: Any, findings: list
     single = [prop for prop in properties if not is_list(prop)]
     packed = next((prop for prop in single if prop.name in _PACKED_COLOURS and prop.val_dtype == "u1"), None)
     surplus = path.stat().st_size - header.end - count * row_type(properties).itemsize
-    # Two bytes of colour per row remain after the declared ones.
+    # Two bytes of colour per row follow the declared bytes.
     if packed is None or len(single) < len(properties) or count == 0 or surplus != 2 * count:
         return b""
     if names & {"red", "green", "blue", "f_dc_0"}:

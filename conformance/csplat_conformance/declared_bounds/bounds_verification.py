@@ -251,7 +251,7 @@ def _build_verification(
 ) -> BoundsVerification:
     """Return the result, with the measures in the order of the registry and each clause once.
 
-    Without `contradictions`, those of `claims` are the failures.
+    Without `contradictions`, the contradictions in `claims` are the failures.
     """
     contradictions = claims.contradictions if contradictions is None else contradictions
     clauses = tuple(dict.fromkeys(clause for clause, _ in contradictions))
@@ -386,7 +386,7 @@ def _find_worst_splats(
         beyond = np.stack(
             [largest[name] > bounds[name] + bound_tolerance(name, bounds[name], reach) for name in largest]
         )
-        best = int(beyond.sum(axis=0).argmin())  # of `near`
+        best = int(beyond.sum(axis=0).argmin())  # row of `near`
         for name, is_beyond in zip(largest, beyond[:, best].tolist(), strict=True):
             error = float(largest[name][best])
             if is_beyond and (name not in worst or error > worst[name].found):

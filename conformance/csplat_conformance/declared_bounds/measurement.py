@@ -21,7 +21,7 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.types import F32, F64
 
-_LOG_SCALE_MAX = 88.0  # magnitude; larger ones count as this (5.5)
+_LOG_SCALE_MAX = 88.0  # largest magnitude of a log scale; larger values are clamped to it (5.5)
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 

@@ -30,8 +30,8 @@ UNDECIDED = -2  #: there are more candidates than were compared
 #: The stage that `Progress` is called with.
 STAGE = "matching splats"
 
-_HALF_DIAGONAL = 0.87  # of a unit cube, √3 / 2, rounded up
-_ROUNDING = 2.0**-22  # of a centre in float32, relative; a few times the error of one rounding
+_HALF_DIAGONAL = 0.87  # half the diagonal of a unit cube, √3 / 2, rounded up
+_ROUNDING = 2.0**-22  # relative error of a centre in float32: a few times that of a single rounding
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats per task of a thread
 _FIRST = frozenset(("means", "opacities", "sh0"))  # measures to compare first, the cheap ones
@@ -39,7 +39,7 @@ _PAIR_BLOCK = 4096  # pairs to compare at a time
 _CANDIDATES_MAX = 1000  # splats of one cell to compare; bounds the time for scenes of equal splats
 _HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Fibonacci hashing)
 _HASH_SHIFT = np.uint64(29)  # bits; brings high bits down, which a product does not
-_EXPONENT_MIN = -1000.0  # of a radius, instead of minus infinity for a radius of 0
+_EXPONENT_MIN = -1000.0  # smallest exponent of a radius, instead of minus infinity for a radius of 0
 
 
 def find_partners(

@@ -255,7 +255,7 @@ def _select_coded_colours(
 
 
 def _chroma(rgb: F64) -> F64:
-    """Return Co and Cg, [2, ...], of colours [..., 3]; 0 where their size is that of rounding errors."""
+    """Return Co and Cg, [2, ...], of colours [..., 3]; values no larger than rounding errors become 0."""
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     chroma: F64 = np.stack([r - b, g - (r + b) / 2.0])
     return np.where(np.abs(chroma) > _NEGLIGIBLE * np.abs(rgb).max(initial=0.0), chroma, 0.0)

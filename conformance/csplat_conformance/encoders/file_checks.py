@@ -85,7 +85,7 @@ def check_content(
 
 
 def _find_unpaired(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
-    """Return a defect for splats far from the source, and one for those near a splat that is represented already."""
+    """Return a defect for splats far from the source, and a defect for splats near a represented splat."""
     wrong = []
     if pairs.strays:
         far = f"not within {case.separation / 2.0:g} of a splat of the source"

@@ -18,7 +18,7 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 #: Directions and colours of the lights.
 _LIGHTS = np.array(((0.8, -0.3, 0.5), (-0.7, 0.2, -0.6), (0.2, -0.3, -0.9), (-0.5, 0.3, 0.8)))
 _LIGHT_COLOURS = np.array(((1.0, 0.9, 0.7), (0.2, 0.5, 1.0), (0.9, 0.3, 0.2), (0.3, 0.9, 0.4)))
-_FACETS = 150  # of the ball of directions to which normals are rounded
+_FACETS = 150  # number of directions to which normals are rounded
 _OPPOSITE_MAX = 1e-9  # 1 + z of a normal that counts as opposite to z
 _LOBE = (1.0, 0.8, 0.6)  # weight of a highlight by band
 

@@ -159,7 +159,7 @@ class _Scanner:
                 raise self.error("neither comma nor end of an array")
 
     def string(self) -> str:
-        """Read a string; one that is not Unicode text is an error."""
+        """Read a string; a string that is not Unicode text is an error."""
         match = _STRING.match(self.text, self.at)
         if match is None:
             raise self.error("no string")

@@ -29,7 +29,7 @@ _SIZES_MIN = {
 _CODEBOOK_ID_SIZE = 2  # bytes
 _STEP_MIN = Fraction(1, 2**1022)  # the smallest normal binary64
 _BINARY32_MIN, _BINARY32_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)  # normal values
-_BINARY32_BITS = 24  # of a significand
+_BINARY32_BITS = 24  # bits of a binary32 significand
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
 #: Axis of each direction (right, left, up, down, front, back): an orientation names each axis once.
 _AXIS_OF_DIRECTION = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
@@ -239,7 +239,7 @@ def _is_normal_binary32(step: Fraction) -> bool:
 def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     """Read the codebook records from `at` on, check RES-1 and CBR-1 to CBR-4, and return the end offset.
 
-    Adds the valid ones to `index.codebooks`, and the ids of all to `index.codebook_ids`.
+    Adds valid records to `index.codebooks`, and all ids to `index.codebook_ids`.
     """
     last = -1
     for _ in range(_count_fitting_records(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
@@ -299,7 +299,7 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, log: Violati
 
 
 def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
-    """Check EXR-2 and EXR-3, and add the name to `names`, those of the preceding columns."""
+    """Check EXR-2 and EXR-3, and add the name to `names`, the names of the preceding columns."""
     raw, padding = placed.record.name[: placed.record.name_size], placed.record.name[placed.record.name_size :]
     if any(padding):
         log.add_field("EXR-3", placed, "name", "bytes after the name are not 0", within=len(raw))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 # Block types, symbols and limits of RFC 1951, 3.2.3 to 3.2.7.
 _STORED, _FIXED, _DYNAMIC = 0, 1, 2
-_END_OF_BLOCK = 256  # symbol; smaller ones are literals
+_END_OF_BLOCK = 256  # symbol; smaller symbols are literals
 _FIRST_LENGTH, _LENGTH_MIN = 257, 3  # smallest symbol of a match, and the length that it stands for
 _LITERALS_MAX, _DISTANCES_MAX = 286, 30  # symbols of each code
 _CODEWORD_BITS_MAX = 15
@@ -186,7 +186,7 @@ class Inflater:
     def _read_symbol(self, code: _Code) -> int:
         """Read a codeword and return its symbol (RFC 1951, 3.2.2); COD-8 if there is none."""
         word = first = 0  # the bits so far, and the first codeword of that length
-        index = 0  # of the first symbol with a codeword of that length
+        index = 0  # index of the first symbol with a codeword of that length
         for count in code.counts:
             word |= self._read_bits(1)
             if word - first < count:

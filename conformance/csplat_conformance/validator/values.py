@@ -64,7 +64,7 @@ def _check_lattice_range(
     log: ViolationLog, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
 ) -> None:
     """Check LAT-4 of integers [C, n], at least one each; LAT-5 if it holds and the step is valid."""
-    luma_count = len(rows) // 3  # of YCOCG: the columns of Y come first, then those of Co and Cg
+    luma_count = len(rows) // 3  # number of Y columns of YCOCG, which precede the Co and Cg columns
     for column, row in enumerate(rows):
         shift = record.chroma_shift if column >= luma_count and record.mapping == _spec.MAPPING_YCOCG else 0
         largest = max(abs(int(row.min())), abs(int(row.max()))) << shift

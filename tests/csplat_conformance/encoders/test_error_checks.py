@@ -1,4 +1,4 @@
-"""The encoder suite's checks of the errors that a file declares, and where pictures must judge instead.
+"""The encoder suite's checks of the errors that a file declares, and when renders must be compared instead.
 
 Also: csplat_conformance.encoders.render_checks.
 """

@@ -46,7 +46,8 @@ def test_a_psnr_is_reached_by_nearly_the_smallest_file(goal):
     def check(case):
         name, no_prune = case
         found = found_in(name, no_prune=no_prune, psnr=goal)
-        assert goal <= found.file.psnr() <= goal + 0.3 + SCENES[name].jump
+        # A margin of 0.1 dB, and what another file would not be worth: 0.16 dB for all splats.
+        assert goal <= found.file.psnr() <= goal + 0.27 + SCENES[name].jump
         assert len(found.file) <= LARGER * SCENES[name].smallest(goal, no_prune=no_prune)
         packed = [file for file in found.scored if file.contents.options.deflate_level is None]
         assert len(found.file) == min(len(file) for file in packed if file.psnr() >= goal)

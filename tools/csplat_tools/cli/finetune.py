@@ -47,7 +47,7 @@ def finetune(
 
     --data or --self is required: values are tuned through the encoder's
     quantisers until renders of the file match the images, or the renders of
-    the scene own_renders. Targets choose the number of splats and lambda. Requires
+    the scene itself. Targets choose the number of splats and lambda. Requires
     the render extra.
 
     Examples:

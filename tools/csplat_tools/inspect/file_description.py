@@ -457,7 +457,7 @@ def _summarise_levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSumm
 
 
 def _overhead_sizes(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
-    """Return the bytes outside attributes, by name; together with those of all attributes they are the file's size.
+    """Return the bytes outside attributes, by name. With the bytes of all attributes, they add up to the file's size.
 
     Chunks of one type, of which a file may have several if it is unknown, are added up. "unknown_layers", if there are
     any, are chunks of the tiles' layers of unknown ids.

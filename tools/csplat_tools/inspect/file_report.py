@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from mmap import mmap
 from pathlib import PurePath
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import DeclaredBounds, decode
+from csplat.types import null_progress
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
@@ -132,7 +133,8 @@ def _compare_with_source(data: bytes | mmap, source: str, context: Context) -> _
     views = find_view_set(loaded.model(), count=0)
     hardest, shown = html.HardestPlaceSearch(), display_cameras(loaded.model(), views)
     scores = views.test_scorer(loaded.model(), context=context).scores(model, progress=context.progress)
-    showing = Scorer.of_source(loaded.model(), shown, views.test_background, context=context)
+    quiet = replace(context, progress=null_progress)
+    showing = Scorer.of_source(loaded.model(), shown, views.test_background, context=quiet)
     showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None

@@ -12,6 +12,7 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import EncodeOptions, Importance, apply_weight_floor, max_class_count
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import null_progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.file_streams import open_output
@@ -96,7 +97,8 @@ def measure_scene(
     measured = measure_views(model, cameras, views.background, matrices=matrices, context=context)
     missed = float("nan")
     if check:
-        elsewhere = measure_pruning_error(model, check, background=views.background, context=context).seen
+        quiet = replace(context, progress=null_progress)
+        elsewhere = measure_pruning_error(model, check, background=views.background, context=quiet).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
     return SceneSensitivity(model, measured, source, missed)
 
@@ -125,9 +127,10 @@ def measure_views(
     """
     if not len(model):
         raise InputError(_NOTHING)
-    context.progress("compiling", 0.0)  # takes some seconds unless cached
-    measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
-    context.progress("compiling", 1.0)
+    if context.progress is not null_progress:  # compiling takes some seconds unless cached
+        context.progress("compiling", 0.0)
+        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
+        context.progress("compiling", 1.0)
     sensitivity = measure_sensitivity(
         model, cameras, background=background, metric=matrices, magnitudes=magnitudes, context=context
     )

@@ -40,6 +40,7 @@ from csplat.errors import InputError
 from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.scene import drop_bands
+from csplat.types import null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
@@ -318,7 +319,7 @@ class TargetSearch:
         The saving is compared with the splats of `subset`, whose measured error corrects the pruning order.
         """
         size_bytes, allowed, count = self.goal.size_bytes, self._allowed, len(subset.model)
-        # With all bands that the options keep: an error of dropped bands is not one of pruning.
+        # With all bands that the options keep: the error of dropped bands is not due to pruning.
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
         pruned = self._unquantised_error(subset, with_bands)
         if size_bytes is None:
@@ -426,7 +427,8 @@ class TargetSearch:
     def _first_quality(self, subset: Subset, coding: Coding) -> float:
         """Return the precision of the first draft of a subset with a coding, dB.
 
-        It follows from the last candidate of the coding, whose splats may differ; without any, it is that of `_USUAL`.
+        It follows from the last candidate of the coding, whose splats may differ; without such a candidate, it is
+        the precision of `_USUAL`.
         """
         size_bytes = self.goal.size_bytes
         for candidate in reversed(self.pool.made):
@@ -806,8 +808,9 @@ def _is_empty(scorer: Scorer) -> bool:
 def _psnr_elsewhere(source: SplatModel, chosen: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
     """Return the PSNR on views that were not used in the search, dB to three decimals, by kind."""
     model, groups = decode(chosen.result.data), extra_test_cameras(source).items()
+    quiet = replace(context, progress=null_progress)
     return {
-        kind: round(Scorer.of_source(source, cameras, views.background, context=context).psnr(model), 3)
+        kind: round(Scorer.of_source(source, cameras, views.background, context=quiet).psnr(model), 3)
         for kind, cameras in groups
     }
 

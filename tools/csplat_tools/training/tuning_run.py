@@ -57,10 +57,10 @@ from csplat_trainer.tuning import (
     split_views,
 )
 
-#: Factor of the learning rates, by whether the reference are the scene's own renders. Its own renders can be matched
+#: Factor of the learning rates, by whether the references are the scene's own renders. Its own renders can be matched
 #: almost exactly, and large steps lose quality that small steps are slow to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
-#: Default of lambda, loss per bit and splat, by whether the reference are the scene's own renders. Their loss is
+#: Default of lambda, loss per bit and splat, by whether the references are the scene's own renders. Their loss is
 #: smaller.
 RATE_WEIGHT = {False: 1e-4, True: 2e-5}
 #: Entries of the codebook of shapes. It pays with clustering by sensitivities and tuning; `encode` has neither, and
@@ -456,11 +456,12 @@ class Tuner:
             if self.views.images:
                 pruner.steps_factor *= _DRAFT_STEPS
             cameras = shrink_cameras(pruner.views.validation, pruner.size)  # not the views of refits
-            scorer = Scorer.of_source(pruner.source, cameras, self.views.background, context=self.context)
+            quiet = replace(self.context, progress=null_progress)
+            scorer = Scorer.of_source(pruner.source, cameras, self.views.background, context=quiet)
             pool = CandidatePool(self.encoding, scorer, self.context.progress)
-            whole = WholeScene(pruner.source, None, None, replace(self.context, progress=null_progress))
+            whole = WholeScene(pruner.source, None, None, quiet)
             missed = 0.0 if target.psnr is None else self._image_error(pruner.source)
-        # Values are sizes or errors of drafts; results are those of the tuned files.
+        # Values are sizes or errors of drafts; results are sizes or errors of the tuned files.
         is_size = target.size_bytes is not None
         goal = value = float(target.size_bytes or error_of_psnr(target.psnr or 0.0))
         made, drafts = list[TunedSubset](), list[Candidate]()

@@ -486,7 +486,7 @@ def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple
 def _choose_background(
     background: Colour | None, record: TrainingRecord | None, *, images: bool = False
 ) -> tuple[Colour, list[str]]:
-    """Return the background colour: the user's, that of the training, or black, and remarks.
+    """Return the background colour: the user's, the training's, or black; and remarks.
 
     A remark points out a colour that is not the training's and, with `images`, that the training's is unknown.
     """

@@ -13,6 +13,7 @@ import typer
 
 import csplat
 from csplat.types import F32, F64
+from csplat_bench.scenes import SAMPLE
 from csplat_render import Camera
 from csplat_render.camera import intrinsics
 from csplat_render.virtual_cameras import virtual_cameras
@@ -20,7 +21,6 @@ from csplat_trainer.parameters import ParameterArrays
 from native_step.refit_steps import (
     GROUPS,
     PHASES,
-    SAMPLE,
     CompiledRefit,
     NumbaRefit,
     StepInputs,
@@ -34,14 +34,16 @@ from native_step.refit_steps import (
 # Limits of differences between two renderers in float32. Where an alpha or a transmittance is within rounding of its
 # minimum, they may decide differently. This changes the pixel by about 1/255 of a colour, and the gradients
 # of its splats.
-_IMAGE, _UNEQUAL_PIXELS, _DECISION = 1e-5, 2e-4, 1e-2  # of other pixels; fraction of such pixels; of these
+_IMAGE = 1e-5  # largest difference of a pixel without such a decision
+_UNEQUAL_PIXELS = 2e-4  # largest fraction of pixels with one
+_DECISION = 1e-2  # largest difference of such a pixel
 _GRADIENT = 1e-2  # relative to the largest of the group
 # The same, in images without such pixels. Gradients of the shape of a single small splat cancel: with numba, float32
 # differs from float64 by 3e-4.
 _EDGE_GRADIENT = 1e-3
-_ERROR = 1e-6  # of the squared error, relative to that of the library's own image in float64
+_ERROR = 1e-6  # largest relative difference from the squared error in float64 of the library's own image
 
-_CHECK_LENGTH, _BENCH_LENGTH = 0.02, 1e-4  # of steps; short ones leave the scene as it is while it is measured
+_CHECK_LENGTH, _BENCH_LENGTH = 0.02, 1e-4  # root mean square errors; short steps hardly change the measured scene
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False, help=__doc__)
 

@@ -9,7 +9,8 @@
 namespace csplat {
 namespace {
 
-constexpr int kDigitBits = 11, kDigits = 1 << kDigitBits;  // of the radix sort; three passes cover a float
+// Bits and values of a digit of the radix sort; three passes cover a float.
+constexpr int kDigitBits = 11, kDigits = 1 << kDigitBits;
 constexpr int kChunks = 8;
 
 void scatter(int64_t count, int shift, int32_t* places, const uint32_t* keys, const int32_t* order, uint32_t* keys2,

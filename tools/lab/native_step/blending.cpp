@@ -32,10 +32,10 @@ namespace csplat {
 namespace {
 
 constexpr int kSquare = 4;                          // width and height of a square, pixels
-constexpr int kSquares = kTilePixels / kBlock;      // of a tile
+constexpr int kSquares = kTilePixels / kBlock;      // squares per tile
 constexpr int kRows = kBlock / kParts / kSquare;    // rows of a part
 constexpr int kBatch = 8;                           // splats that are expanded before they are blended
-constexpr float kMargin = 0.01f;                    // of the bounds of exponents of 2, for rounding
+constexpr float kMargin = 0.01f;                    // margin of the bounds of exponents of 2, for rounding
 constexpr uint32_t kAllParts = kParts == 1 ? 0xFFFF : 0xFFFFFFFF;
 constexpr uint32_t kAllSquares = (1u << kSquares) - 1, kAllLanes = (1u << kFloats) - 1;
 

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <chrono>
 #include <exception>
+#include <memory>
 
 #include "engine.h"
 
@@ -38,7 +39,7 @@ extern "C" {
 Engine* csplat_refit_new(int count, int degree, const float* rows, const int32_t* order, int threads) {
   if (degree < 0 || degree > kHighestDegree || count < 0 || threads < 1) return nullptr;
   try {
-    Engine* engine = new Engine(threads);
+    auto engine = std::make_unique<Engine>(threads);
     engine->count = count;
     engine->degree = degree;
     engine->higher = (degree + 1) * (degree + 1) - 1;
@@ -61,7 +62,7 @@ Engine* csplat_refit_new(int count, int degree, const float* rows, const int32_t
       for (int k = 0; k < engine->value_count; k++)
         engine->values[(static_cast<size_t>(i / kBlock) * engine->value_count + k) * kBlock + i % kBlock] =
             rows[static_cast<size_t>(engine->sources[i]) * engine->value_count + k];
-    return engine;
+    return engine.release();
   } catch (const std::exception&) {
     return nullptr;
   }

@@ -28,12 +28,10 @@ from csplat_render.conventions import UncheckedSplats, view_vector
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_trainer import parameters as trainer_parameters
 from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, from_model
+from csplat_trainer.splat_refit import _BETA2, _RATES
 
 _SOURCES = Path(__file__).resolve().parent
 _ROOT = _SOURCES.parents[2]
-
-#: The scene that ships with the project.
-SAMPLE = _ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 
 #: Groups of values that a refit changes, in the order of the library's rows; means come before them.
 GROUPS = ("quats", "scales", "logits", "sh0", "shN")
@@ -46,10 +44,6 @@ _REQUIRED_FLAGS = {
     "avx2": "avx2 fma",
     "avx512": "avx2 fma bmi1 bmi2 f16c abm movbe avx512f avx512bw avx512cd avx512dq avx512vl",
 }
-
-# As in csplat_trainer.splat_refit: learning rates per unit of the root mean square error, and Adam's decay of squares.
-_RATES = {"quats": 0.023, "scales": 0.39, "logits": 1.95, "sh0": 0.1, "shN": 0.04}
-_BETA2 = 0.98
 
 _MORTON_TOP = (1 << 21) - 1  # largest coordinate of a Morton code
 
@@ -123,7 +117,7 @@ def disturbed_values(model: SplatModel) -> ParameterArrays:
 
 def rates_of(length: float) -> dict[str, float]:
     """Return the learning rate of each group for a step of this length (a root mean square error, 0 to 1)."""
-    return {name: rate * length for name, rate in _RATES.items()}
+    return {name: _RATES[name] * length for name in GROUPS}
 
 
 class NumbaRefit:

@@ -7,8 +7,9 @@ import pytest
 
 pytest.importorskip("numba", reason="the kernels are compared with those of the extra [render]")
 
+from csplat_bench.scenes import SAMPLE
 from native_step.__main__ import hashes_of, relative_differences
-from native_step.refit_steps import GROUPS, SAMPLE, CompiledRefit, NumbaRefit, StepInputs, available_sets, build
+from native_step.refit_steps import GROUPS, CompiledRefit, NumbaRefit, StepInputs, available_sets, build
 
 pytestmark = pytest.mark.slow  # compiling takes five seconds
 

@@ -196,7 +196,7 @@ class _TileWriter:
     def __init__(self, splats: int) -> None:
         self._splats = splats
         self._blocks = -(-splats // BLOCK)
-        self._planes: list[Words] = []  # one word of every splat each, padded to whole blocks
+        self._planes: list[Words] = []  # each array holds one word per splat, padded to whole blocks
         self._bit = 0  # number of bits of a splat so far
         self._band_words: list[Words] = []  # what follows the geometry
         self._indices: dict[int, int] = {}  # first word, by id of the array

@@ -37,15 +37,15 @@ _PAGE_WORDS = 1 << 23
 _SCREEN_TILE = 16  # pixels, width and height
 _RECORD_BYTES = 16  # in each of the two buffers of records
 _PIXEL_BYTES = 16  # four numbers of binary32
-_WORD_BYTES = 4  # of keys, values and sums
+_WORD_BYTES = 4  # bytes of a key, a value or a sum
 _RANGE_BYTES = 8  # first and last pair of a screen tile
-_GROUP_COUNT_BYTES = 12  # of a row of the table of workgroups, three numbers
-_GROUPS_BYTES = 64  # of that table: its rows, and the arguments of a draw, 13 numbers
+_GROUP_COUNT_BYTES = 12  # bytes of a row of the table of workgroups: three numbers
+_GROUPS_BYTES = 64  # bytes of that table: its rows and the arguments of a draw, 13 numbers, rounded up
 _BLOCK_BYTES = 36  # of a block's splats in view: place of the first record, 8 words of bits, see cull.wgsl
-_DIGIT_BITS = 8  # of the keys that a pass of a sort sorts by
+_DIGIT_BITS = 8  # bits of the keys that one pass of a sort orders
 _DIGITS = 1 << _DIGIT_BITS
-_KEY_BITS = 31  # of the largest depth, see `_LAST_KEY`
-_DEPTH_KEY_BITS = 32  # that the depth sort sorts by
+_KEY_BITS = 31  # bits of the largest key, `_LAST_KEY`
+_DEPTH_KEY_BITS = 32  # bits of the keys that the depth sort orders
 _CLEARED_PIXELS, _CLEARING_ROWS = 256, 64  # pixels per workgroup, and rows of workgroups that clear an image
 _LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
 _MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
@@ -156,8 +156,8 @@ class GpuScene:
         corners: list[F64] = []
         steps: list[float] = []
         page: list[NDArray[np.uint32]] = []
-        words = 0  # of the page so far
-        first_block = 0  # of the page
+        words = 0  # number of words in the page so far
+        first_block = 0  # first block of the page
         for tile in _tiles_of(scenes, tables, antialiased, sh_degree):
             if page and words + len(tile.words) > _PAGE_WORDS:
                 self._add_page(page, first_block)

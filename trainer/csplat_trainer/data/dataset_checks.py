@@ -196,7 +196,7 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[float, float]
 def _aspect_error(
     path: Path, size: tuple[int, int], expected: tuple[float, float], source: str, remedy: str
 ) -> InputError:
-    """Return the error for an image whose aspect ratio is not the expected one, that of the `source`."""
+    """Return the error for an image whose aspect ratio is not that expected by `source`, a phrase for the message."""
     actual, shape = f"{size[0]}×{size[1]}", f"{expected[0]:g}×{expected[1]:g}"
     return InputError(f"{path} has {actual} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
 

@@ -406,7 +406,7 @@ def _match_by_keys(
     known_key: _Key,
     where: str,
 ) -> dict[str, str]:
-    """Return the known name of each listed name with an equal key; names without one are omitted.
+    """Return the known name of each listed name with an equal key; names without a match are omitted.
 
     Raises:
         InputError: a name matches two known names, or two names match the same known name.

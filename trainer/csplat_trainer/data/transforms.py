@@ -368,10 +368,10 @@ def _read_document(place: SetFolder, path: Path) -> dict[str, Any]:
 
 
 def _read_lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
-    """Read the intrinsics and distortion of a frame; the size is that of the image file if w or h is missing.
+    """Read the intrinsics and distortion of a frame; the size is read from the image file if w or h is missing.
 
     Args:
-        values: values of the frame, and those of the document that it does not override.
+        values: values of the frame, and the document's values that it does not override.
         image: the frame's image file.
         where: the frame's place, for messages.
 

@@ -173,7 +173,7 @@ def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult
         decoded: the file's splats.
 
     Raises:
-        RuntimeError: it does not.
+        RuntimeError: the file holds other values.
     """
     row_of_source = np.empty(int(source_index.max()) + 1, np.int64)  # other indices stay undefined, and unused
     row_of_source[source_index] = np.arange(len(source_index))

@@ -17,6 +17,7 @@ import numpy as np
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.errors import InputError
+from csplat_render.kernels import thread_count
 from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import COUNT_EVERY, FitStep, Fitter
@@ -83,7 +84,8 @@ def tune(
     tuning = _Tuning(fixed, views, options or FinetuneOptions(), outputs, show, context, size_bytes)
     if outputs.resume is not None:
         tuning.resume(outputs.resume)
-    return tuning.run()
+    with thread_count(context.threads):
+        return tuning.run()
 
 
 @dataclass
@@ -212,7 +214,7 @@ class _Tuning:
         }
 
     def _make_engine(self, parameters: Parameters | None) -> TuningEngine:
-        """Return the engine of the requested device, with the state of a checkpoint or, for `None`, the initial one.
+        """Return the engine of the requested device, with the state of a checkpoint or, for `None`, the initial state.
 
         Raises:
             InputError: a package or the GPU is absent.

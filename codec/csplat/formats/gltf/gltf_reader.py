@@ -57,7 +57,7 @@ _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_meta
 _LARGE = 1e6  # huge values are only counted in primitives with a value above this
 _FAR = 4096.0  # scene units; a larger translation becomes the origin: float32 resolves it to 0.0005 at best
 _ALIKE = 0.1  # fraction of the scene's extent by which equivalent bounds may differ
-_STRETCHES = (1e-30, 1e30)  # range of the largest singular value of a node's transform: beyond, lengths leave float32
+_STRETCHES = (1e-30, 1e30)  # range of the largest singular value of a node's transform: beyond, products may
 _SINGULAR = 1e-9  # a transform whose singular values have a smaller ratio is singular
 _SAMPLE = 4096  # number of splats on which the error of fitted colours is measured
 _SHOWN_NAME = 60  # characters of a program's name in messages
@@ -234,7 +234,7 @@ class _GltfReading:
         return bad, infinite
 
     def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
-        """Count the rows with huge scales or coefficients; `good` [n] masks those of `rows` to look at, `None`: all."""
+        """Count the rows with huge scales or coefficients; `good` [n] masks the rows to check, `None`: all."""
         kept = slice(None) if good is None else good
         scales = log_scales(arrays["SCALE"].values(rows)[kept])
         return count_huge_rows(

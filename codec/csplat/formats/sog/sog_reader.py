@@ -112,7 +112,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
     """Open a level of streamed SOG with its environment; blocks are read file by file.
 
     With `max_splats`, the level is the finest of at most this number of splats, else the coarsest. Findings about a
-    file are added to those of the scene when its blocks are first read.
+    file are added to the scene's findings when its blocks are first read.
     """
     names, leaves = _read_leaves(parts, meta)
     coarsest = max([max(leaf) for leaf in leaves], default=0)
@@ -204,7 +204,7 @@ def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
 
 
 def _collect_ranges(parts: SogParts, names: list[str], spans: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
-    """Return the ranges (first splat, end) to read by file, ascending, without empty ones; refuse overlaps."""
+    """Return the ranges (first splat, end) to read by file, ascending, without empty ranges; refuse overlaps."""
     ranges_by_file: dict[str, list[tuple[int, int]] | None] = {}
     last_file, last_stop = -1, 0
     for file, start, stop in sorted(span for span in spans if span[2] > span[1]):
@@ -316,7 +316,7 @@ def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
 
 
 def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `mins` and `maxs` of a section, [channels] each; refuse crossed ones."""
+    """Return `mins` and `maxs` of a section, [channels] each; refuse crossed bounds."""
     low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
     for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
         reason = f"mins {low[channel]:.6g}, expected at most maxs {high[channel]:.6g}"
