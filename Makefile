@@ -15,10 +15,11 @@ CLANG ?= $(shell command -v clang || command -v clang-14 || echo clang)
 # Without the tracing of comparisons, which takes three quarters of the time and finds no more.
 FUZZED := -std=c99 -g -O2 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -fno-sanitize-coverage=trace-cmp
 SAMPLE := tools/csplat_tools/data/sample.ply
+NATIVE := trainer/csplat_render/native/build.py
 
 .DEFAULT_GOAL := help
 
-.PHONY: help demo examples check test lab-test test-all dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
+.PHONY: help demo examples check test lab-test test-all native dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
 	@grep -E '^[a-z%-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
@@ -37,21 +38,25 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
-check: $(VENV)/.dev ## half a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
+check: $(VENV)/.dev native ## half a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
 	tests/run.sh check
 
-test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
+test: $(VENV)/.dev native ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
 	tests/run.sh test
 
-lab-test: $(VENV)/.dev ## the laboratories: authoring, planted faults, fuzzing, benchmarks
+lab-test: $(VENV)/.dev native ## the laboratories: authoring, planted faults, fuzzing, benchmarks
 	tests/run.sh lab
 
-test-all: $(VENV)/.all ## all of these with every marker: browsers, engines, peers, torch, GPU, S3, Dask, long fuzzing
+test-all: $(VENV)/.all native ## all of these with every marker: browsers, engines, peers, torch, GPU, S3, Dask, long fuzzing
 	tests/run.sh all
 
 part-lab: lab-test
-part-%: $(VENV)/.all ## the tests of one marker: make part-browser
+part-%: $(VENV)/.all native ## the tests of one marker: make part-browser
 	tests/run.sh part $*
+
+native: | $(BIN)/python ## compile the library of the renderer, if its sources have changed
+	@needed=$$($(BIN)/python $(NATIVE) --requires) && { [ -z "$$needed" ] || $(INSTALL) "$$needed"; }
+	@$(BIN)/python $(NATIVE) >/dev/null
 
 lint: $(VENV)/.dev ## style, types and import contracts alone
 	$(BIN)/ruff check .
@@ -66,7 +71,7 @@ format: $(VENV)/.dev ## bring the code into its one layout
 spec: $(VENV)/.dev ## write constants and tables from the registry
 	$(BIN)/python spec/generate.py
 
-sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, train; some minutes
+sample: $(VENV)/.dev native ## make the sample scene again: photograph the garden, train; some minutes
 	$(BIN)/python tools/lab/sample/make_sample.py
 
 docs: $(VENV)/.core ## the documentation, as a site in out/site
@@ -74,18 +79,22 @@ docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(BIN)/python tools/docs/make_site.py
 	@echo "open out/site/index.html"
 
-dist: $(VENV)/.dev ## sdist, wheel and npm package in out/; a release gives TAG and URL, which go into their metadata
+dist: $(VENV)/.dev ## sdist, wheels with and without the library, npm package in out/; a release gives TAG and URL, for metadata
 	rm -rf out/dist out/npm && mkdir -p out/npm
 	$(if $(URL),$(BIN)/python tools/release/prepare.py --tag "$(TAG)" --url "$(URL)")
-	$(BIN)/python -m build --no-isolation --outdir out/dist .
+	CSPLAT_NATIVE=off $(BIN)/python -m build --no-isolation --outdir out/dist .
+	$(if $(filter off,$(CSPLAT_NATIVE)),,CSPLAT_NATIVE=require $(BIN)/python -m build --wheel --no-isolation --outdir out/dist .)
 	cd codec/js && npm pack --silent --pack-destination ../../out/npm
 
-test-dist: ## install out/dist/*.whl in an environment of its own, and run the commands of `make demo` there
+test-dist: FRESH := out/fresh/$(notdir $(BIN))
+test-dist: ## install the wheel that pip chooses of out/dist in an environment of its own; run the commands of `make demo` and `compare`
 	rm -rf out/fresh && $(PYTHON) -m venv out/fresh
-	out/fresh/$(notdir $(BIN))/python -m pip install --quiet --disable-pip-version-check out/dist/csplat-*.whl
-	$(MAKE) --no-print-directory demo BIN=out/fresh/$(notdir $(BIN)) CORE=
+	$(FRESH)/python -m pip download --quiet --no-index --no-deps --only-binary :all: --find-links out/dist --dest out/fresh/wheel csplat
+	$(FRESH)/python -m pip install --quiet --disable-pip-version-check "$$(echo out/fresh/wheel/*.whl)[render]"
+	$(MAKE) --no-print-directory demo BIN=$(FRESH) CORE=
+	$(FRESH)/csplat compare $(SAMPLE) out/sample.csplat
 
-bench: $(VENV)/.dev ## measure what is missing in out/bench, suite by suite; a day or more
+bench: $(VENV)/.dev native ## measure what is missing in out/bench, suite by suite; a day or more
 	$(BIN)/pytest tools/lab/tests
 	for suite in codec formats file_parts decoder_agreement decoders targets rendering training viewer; do \
 		$(BENCH) run $$suite || exit 1; \

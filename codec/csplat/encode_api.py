@@ -100,13 +100,12 @@ def encode(
             preset "fast" tries no codebooks and keeps all splats.
         out: a path, written atomically and replaced if it exists, or an open binary file; `None`: return the bytes.
         target: the target that a search meets; `None`: encode with the options as they are. All targets but largest
-            errors alone require rendering, which takes minutes, and the packages of the extra `render`. A target
-            requires the scene in memory.
+            errors alone require rendering, which takes minutes. A target requires the scene in memory.
         views: a `csplat_tools.ViewSet` of training, validation and test views for the search; `None`: virtual ones
             around the scene.
         importance: see `EncodePlan.of`; requires the scene in memory.
         levels: number of levels of detail above the scene, 1 to 16, "auto" or a builder; their bytes count for a
-            target. Building them takes minutes per million splats, and the extra `render`. `None`: the file has none.
+            target. Building them takes minutes per million splats. `None`: the file has none.
         context: threads, workers, memory, seed and progress.
 
     Returns:
@@ -251,5 +250,5 @@ def _plugin(group: str, name: str, what: str) -> Any:
     """Load an entry point of a group; raise an `InputError` that names the feature `what` if it is absent."""
     plugin = load_plugins(group).get(name)
     if plugin is None:
-        raise InputError(f"no {what} is installed (entry points of {group}): pip install 'csplat[render]'")
+        raise InputError(f"no {what} is installed (entry points of {group}): pip install csplat")
     return plugin

@@ -116,7 +116,7 @@ def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgr
             if reference_renders.can_render():
                 outcomes += reference_renders.score_own_renderer(vector)
             else:
-                outcomes += reference_renders.skip_views(vector, "needs the packages of the extra render")
+                outcomes += reference_renders.skip_views(vector, "needs csplat's compiled renderer")
         if CUTS in options.levels and cuts_of_vector(vector):
             outcomes.append(compare_cuts(vector, _own_cuts(vector)))
         return outcomes

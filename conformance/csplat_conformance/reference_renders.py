@@ -12,7 +12,6 @@ are read and written without an imaging library.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import struct
@@ -45,8 +44,14 @@ _CHANNELS = {0: 1, _RGB: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alph
 
 
 def can_render() -> bool:
-    """Return True if csplat's renderer can be imported (the extra `render`)."""
-    return importlib.util.find_spec("numba") is not None
+    """Return True if csplat's renderer is installed and supports this processor."""
+    from csplat_render.kernels import require_library  # only this level requires the renderer
+
+    try:
+        require_library()
+    except InputError:
+        return False
+    return True
 
 
 def quantise_render(rgb: NDArray[Any]) -> U8:
@@ -56,8 +61,8 @@ def quantise_render(rgb: NDArray[Any]) -> U8:
 
 
 def reference_render(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
-    """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
-    from csplat_render.camera import Camera  # only this level needs the extra `render`
+    """Render the expected arrays of a scene from the equations, in binary64."""
+    from csplat_render.camera import Camera
     from csplat_render.reference_rasteriser import render_exact
 
     splats: Any = SimpleNamespace(**floats)

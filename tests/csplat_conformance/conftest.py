@@ -42,6 +42,6 @@ def altered(monkeypatch, plain):
         )
         monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
         return run_encoder("x {ply} {out}", EncoderSuiteOptions(name, levels), run=run, render_score=render_score,
-            no_render_reason="no numba")  # fmt: skip
+            no_render_reason="no renderer")  # fmt: skip
 
     return report

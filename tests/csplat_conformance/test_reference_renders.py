@@ -116,7 +116,7 @@ def test_each_fault_of_a_renderer_has_its_status(copier, fault, status, message)
 def test_without_a_renderer_pictures_are_skipped_with_a_note(monkeypatch):
     monkeypatch.setattr(reference_renders, "can_render", lambda: False)
     (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
-    assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
+    assert (Status.SKIPPED, "needs csplat's compiled renderer") == (outcome.status, outcome.message)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])

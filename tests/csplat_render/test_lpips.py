@@ -11,8 +11,6 @@ from csplat.errors import InputError
 from csplat_render import lpips as module
 from csplat_render.lpips import Lpips, load_lpips, load_torch_lpips, save_lpips
 
-pytest.importorskip("numba", reason="SSIM requires the extra [render]")
-
 
 @pytest.fixture
 def random_weights():

@@ -11,8 +11,6 @@ from csplat.errors import InputError
 from csplat.types import PSNR_CAP
 from csplat_render.metrics import Scores, psnr, score_view, ssim
 
-pytest.importorskip("numba", reason="SSIM requires the extra [render]")
-
 
 def two_images(seed=0, height=30, width=41, noise=0.1):
     rng = np.random.default_rng(seed)

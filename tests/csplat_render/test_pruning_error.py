@@ -20,8 +20,6 @@ from csplat_render.pruning_error import measure_pruning_error, pruning_error_exa
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_trainer.sensitivity import measure_sensitivity
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-
 
 @pytest.mark.parametrize("measure", [measure_sensitivity, measure_pruning_error])
 def test_no_cameras_are_refused(measure):
@@ -44,10 +42,8 @@ def test_pruning_errors_agree_with_removing_splats_one_by_one(model, antialiased
     model = with_facts(model, antialiased=antialiased)
     options = {"background": (0.2, 0.5, 0.9), "transmittance_min": 0.0}
     expected = pruning_error_exact(model, views(2), np.arange(30), **options)
-    wide = measure_pruning_error(model, views(2), dtype=np.float64, **options)
-    narrow = measure_pruning_error(model, views(2), **options)
-    assert relative(wide.error, expected)[expected > 0.0].max() < 1e-9
-    assert relative(narrow.error, expected)[expected > 1e-6].max() < 1e-4
+    found = measure_pruning_error(model, views(2), **options)
+    assert relative(found.error, expected)[expected > 1e-6].max() < 1e-4
     assert expected.max() > 0.05
     assert np.count_nonzero(expected) > 20
 

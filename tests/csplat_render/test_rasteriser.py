@@ -1,6 +1,6 @@
 """The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs.
 
-Also: csplat_render.binning, csplat_render.blending, csplat_render.projection, csplat_render.reference_rasteriser.
+Also: csplat_render.reference_rasteriser.
 """
 
 import itertools
@@ -19,12 +19,9 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply
 from csplat_render import render
-from csplat_render.contributions import Contributions
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
-
-pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 
 def scene(count=400, degree=3, seed=0):
@@ -104,7 +101,7 @@ def test_neither_threads_nor_earlier_renders_change_a_bit():
 @pytest.mark.parametrize("mode", ["standard", "fast"])
 def test_rendering_in_slices_of_depth_gives_the_same_bits(mode):
     model, view, behind = scene(), camera(70, 53), (0.3, 0.6, 0.1)
-    rasteriser = Rasteriser(mode, gradients=False)
+    rasteriser = Rasteriser(mode)
     wanted = rasteriser.forward(model, view, background=behind)
     seen = rasteriser.find_visible(model, view)
     near = seen.near
@@ -121,18 +118,18 @@ def test_rendering_in_slices_of_depth_gives_the_same_bits(mode):
 
 def test_invalid_arrays_and_options_are_refused():
     model, view, other = scene(count=5), camera(), camera(width=65)
-    plain, still = Rasteriser(), Rasteriser(gradients=False)
+    plain, sliced = Rasteriser(), Rasteriser()
+    sliced.forward(model, view, state=sliced.initial_state(view))
     bad = UncheckedSplats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
     short = UncheckedSplats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]})
     for message, call in {
         "quats has shape": lambda: plain.forward(bad, view),
         "coefficients": lambda: plain.forward(short, view),
         "mode": lambda: render(model, view, mode="slow"),
-        "dtype": lambda: Rasteriser(dtype=np.float16),
         "forward": lambda: Rasteriser().backward(np.zeros((2, 2, 3))),
         "background": lambda: render(model, view, background=(0.0, float("nan"), 0.0)),
-        "slice": lambda: plain.forward(model, view, state=plain.initial_state(view)),  # it would have no gradients
-        "state": lambda: still.forward(model, view, state=still.initial_state(other)),
+        "all splats": lambda: sliced.backward(np.zeros((view.H, view.W, 3))),
+        "state": lambda: plain.forward(model, view, state=plain.initial_state(other)),
     }.items():
         with pytest.raises(InputError, match=message):
             call()
@@ -146,18 +143,9 @@ def test_gradients_beyond_float32_are_clamped():
     assert all(np.isfinite(value).all() for value in vars(g).values())
 
 
-@pytest.mark.long
-def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
-    model = read_ply(sample_path)
-    view = virtual_cameras(model, 1, 160, 120)[0]
-    flipped, errors = oracle.float32_errors(model, view, random_gradients(view, seed=2))
-    assert flipped <= 10
-    assert max(errors.values()) <= 1e-4, errors
-
-
 def gradients(arrays, *weights, **options):
-    """Return the gradients in float64 of the sum of all colours, or a weighted sum."""
-    rasteriser = Rasteriser(dtype=np.float64)
+    """Return the gradients of the sum of all colours, or a weighted sum."""
+    rasteriser = Rasteriser()
     rasteriser.forward(UncheckedSplats(**arrays), VIEW, **options)
     return rasteriser.backward(*(weights or [np.ones((VIEW.H, VIEW.W, 3))]))
 
@@ -181,8 +169,8 @@ def test_gradients_ignore_the_length_of_a_quaternion():
     plain, longer = (
         factor * gradients(arrays | {"quats": arrays["quats"] * factor}, *weights).quats for factor in (1.0, 10.0)
     )
-    np.testing.assert_allclose(plain, longer, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(np.sum(plain * arrays["quats"], axis=1), 0.0, atol=1e-9)
+    np.testing.assert_allclose(plain, longer, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(np.sum(plain * arrays["quats"], axis=1), 0.0, atol=1e-4)
 
 
 @pytest.mark.long
@@ -190,17 +178,3 @@ def test_ignored_sh_bands_have_no_gradient():
     shN = gradients(random_splats(6, 3, seed=5), sh_degree=1).shN
     assert np.abs(shN[:, :3]).max() > 0.0
     assert not shN[:, 3:].any()
-
-
-@pytest.mark.long
-def test_colour_fits_of_degree_4_have_the_gradients_of_the_rasteriser():
-    arrays = random_splats(20, 4, seed=5)
-    splats, fit, plain = UncheckedSplats(**arrays), Contributions(np.float64), Rasteriser(dtype=np.float64)
-    view = fit.project_view(splats, VIEW)
-    coefficients = np.concatenate([arrays["sh0"][:, None], arrays["shN"]], axis=1).astype(np.float32)
-    gradient, diagonal = np.zeros((20, 25, 3), np.float32), np.zeros((20, 25), np.float32)
-    lit = view.shape[:, 6:9] > 0.0
-    rgb = fit.backproject(view, coefficients, lit, gradient, diagonal, offset=0.5, background=np.zeros(3))
-    np.testing.assert_allclose(plain.forward(splats, VIEW).rgb, rgb, atol=1e-6)
-    wanted = plain.backward(rgb).shN
-    np.testing.assert_allclose(gradient[:, 1:], wanted, atol=1e-5 * np.abs(wanted).max())

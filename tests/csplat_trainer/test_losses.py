@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
+from csplat_render import kernels
+from csplat_render.metric_kernels import convolve
 from csplat_render.metrics import ssim
 from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 def random_images(height, width):
@@ -57,3 +62,35 @@ def test_masked_pixels_do_not_change_the_loss(weights):
     assert not gradient[~mask].any()
     assert gradient[mask].all()
     assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)
+
+
+def digest():
+    """Return a hash of losses, gradients, SSIM and convolutions."""
+    results = hashlib.sha256()
+    for size in ((150, 21), (64, 48)):
+        x, y = random_images(*size)
+        for weights in LOSS_WEIGHTS.values():
+            value, gradient = PhotometricLoss(*size, *weights)(x, y)
+            results.update(np.array([value.l1, value.ssim, value.mse]).tobytes() + gradient.tobytes())
+        weights = np.random.default_rng(0).standard_normal((5, 5, 3, 70)).astype(np.float32)
+        results.update(convolve(x, weights, weights[0, 0, 0], 2, 1).tobytes() + np.array(ssim(x, y)).tobytes())
+    return results.hexdigest()
+
+
+@pytest.mark.slow
+def test_results_have_the_same_bits_with_any_threads_and_instructions(monkeypatch):
+    monkeypatch.setattr(kernels, "available_threads", lambda: 8)
+    found = set()
+    for threads in (1, 2, 8):
+        with kernels.thread_count(threads):
+            found.add(digest())
+    for name in kernels.INSTRUCTION_SETS:
+        environment = {**os.environ, kernels.SET_VARIABLE: name}
+        run = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=False)
+        if "InputError" not in run.stderr:  # the processor has these instructions
+            found.add(run.stdout.strip())
+    assert {digest()} == found
+
+
+if __name__ == "__main__":
+    print(digest())

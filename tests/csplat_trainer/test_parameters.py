@@ -7,12 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
+from csplat_render import kernels
 from csplat_render.camera import intrinsics, orbit
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
+from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, sigmoid, to_model
 from csplat_trainer.strategies import prune_least_needed, relocate
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 @pytest.fixture
@@ -34,6 +33,44 @@ def test_adam_agrees_with_the_textbook(parameters, beta2):
         adam_step(parameters, gradient, dict.fromkeys(GROUPS, 0.01))
     assert np.abs(parameters.values["means"] - x).max() <= 1e-6
     assert np.abs(np.linalg.norm(parameters.values["quats"], axis=1) - 1).max() <= 1e-6
+
+
+def test_a_step_survives_extremes(make_model):
+    values = from_model(make_model(37, 1), 1)  # not a multiple of the vectors' lanes
+    parameters = Parameters.starting_at(values)
+    gradient = {name: np.full_like(array, 1e-25) for name, array in values.items()}  # squares are denormal
+    gradient["means"][3] = np.nan
+    values["quats"][:2] = [[0.0, 1e-13, 0.0, 0.0], [np.nan, 1.0, 0.0, 0.0]]
+    values["quats"][2] = [0.0, 3.0, 0.0, 4.0]
+    values["logits"][:3] = [50.0, -50.0, np.nan]
+    before = values["means"].copy()
+    adam_step(parameters, gradient, dict.fromkeys(GROUPS, 0.0) | {"means": 0.1})
+    assert np.array_equal(before, values["means"])  # moments of NaN, and tiny moments, are 0
+    assert not parameters.second["means"].any()
+    assert np.array_equal([[1, 0, 0, 0]] * 2, values["quats"][:2])
+    assert np.allclose([0.0, 0.6, 0.0, 0.8], values["quats"][2])
+    assert np.array_equal([14.0, -14.0, np.nan], values["logits"][:3], equal_nan=True)
+
+
+def test_steps_do_not_depend_on_the_number_of_threads(make_model, monkeypatch):
+    monkeypatch.setattr(kernels, "available_threads", lambda: 8)
+    results, model = [], make_model(9_000, 3)
+    for threads in (1, 2, 8):
+        parameters, rng = Parameters.starting_at(from_model(model, 3)), np.random.default_rng(0)
+        with kernels.thread_count(threads):
+            for _ in range(2):
+                steps = {name: rng.standard_normal(array.shape).astype(np.float32)
+                         for name, array in parameters.values.items()}  # fmt: skip
+                adam_step(parameters, steps, dict.fromkeys(GROUPS, 0.01))
+            results.append([array.tobytes() for array in (*parameters.values.values(), parameters.alphas)])
+    assert results[0] == results[1] == results[2]
+
+
+def test_opacities_are_sigmoids_rounded_once():
+    logits = np.concatenate([np.linspace(-20, 20, 1003), [-800.0, -90.0, 0.0, 800.0, np.nan]]).astype(np.float32)
+    with np.errstate(over="ignore"):
+        expected = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
+    assert np.array_equal(expected, sigmoid(logits), equal_nan=True)
 
 
 def test_parameters_of_a_model_convert_back(make_model):

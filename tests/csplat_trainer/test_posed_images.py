@@ -15,8 +15,6 @@ from csplat_trainer.posed_images import PosedImage, compose, halve
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 def test_masked_pixels_do_not_influence_training(make_model):
     data, mask = training_images(make_model, alpha=False), np.ones((SIZE, SIZE), bool)

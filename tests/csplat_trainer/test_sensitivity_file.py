@@ -19,9 +19,6 @@ from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-
-
 pytestmark = pytest.mark.usefixtures("small_views")
 
 

@@ -11,8 +11,6 @@ from csplat_render.scorer import renderer
 from csplat_tools.views import camera_sequence
 from csplat_trainer.splat_refit import refit_splats
 
-pytest.importorskip("numba", reason="simplification requires the extra [render]")
-
 pytestmark = pytest.mark.usefixtures("small_views")
 
 

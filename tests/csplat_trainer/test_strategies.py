@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from csplat.encoder.error_bounds import rotation_rows
+from csplat_render import kernels
 from csplat_trainer.parameters import GROUPS, Parameters, from_model
 from csplat_trainer.strategies import ScreenGradients, add_noise, densify, grow, reset_opacities, share_opacity
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 @pytest.fixture
@@ -47,6 +47,28 @@ def test_noise_only_moves_transparent_splats(parameters):
     before = parameters.values["means"].copy()
     add_noise(parameters, 1.0, np.random.default_rng(0).standard_normal(before.shape).astype(np.float32))
     assert [False] * 20 + [True] * 20 == (before != parameters.values["means"]).any(axis=1).tolist()
+
+
+def test_noise_follows_its_formula_with_any_number_of_threads(make_model, monkeypatch):
+    monkeypatch.setattr(kernels, "available_threads", lambda: 8)
+    values = from_model(make_model(2000, 0), 0)
+    values["logits"][:] = np.random.default_rng(1).normal(-5.0, 2.0, 2000)
+    values["scales"][0] = 300.0  # would overflow
+    normals, found = np.random.default_rng(0).standard_normal((2000, 3)).astype(np.float32), []
+    for threads in (1, 8):
+        parameters = Parameters.starting_at({name: array.copy() for name, array in values.items()})
+        with kernels.thread_count(threads):
+            add_noise(parameters, 0.3, normals)
+        found.append(parameters.values["means"])
+    assert np.array_equal(*found)
+    wide = {name: array.astype(np.float64) for name, array in values.items()}
+    gate = 0.3 / (1.0 + np.exp(-100.0 * (1.0 - 1.0 / (1.0 + np.exp(-wide["logits"])) - 0.995)))
+    deviations = np.exp(wide["scales"])
+    rotations = np.moveaxis(np.array(rotation_rows(wide["quats"].T)), 2, 0)
+    local = np.einsum("nji,nj->ni", rotations, normals) * np.minimum(gate[:, None] * deviations, 1.0) * deviations
+    moved = (wide["logits"] < np.log(1.0 / 9.0)) & (np.arange(2000) > 0)
+    expected = wide["means"] + moved[:, None] * np.einsum("nij,nj->ni", rotations, local)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-6, atol=1e-7)
 
 
 def test_densification_clones_small_splits_large_and_prunes(parameters):

@@ -36,8 +36,6 @@ from csplat_trainer.training_loop import fit_to_options, train
 from csplat_trainer.training_options import Outputs, TrainOptions
 from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 def brief(iterations=1, **options):
     return TrainOptions(**{**QUICK, "iterations": iterations, **options})
@@ -242,7 +240,7 @@ def test_a_training_is_planned_by_its_target_and_its_tuning_by_its_length():
 def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_training(data, tmp_path, monkeypatch):
     file, damaged = write_set(tmp_path, data) / "transforms.json", tmp_path / "11.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: pytest.fail("kernels are compiled"))
+    monkeypatch.setattr("csplat_trainer.train", lambda *_, **__: pytest.fail("training began"))
     assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.ply", status=1).stderr
     document = json.loads(file.read_text())
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
@@ -314,7 +312,6 @@ def test_gradients_of_gains_agree_with_finite_differences():
 def test_gains_are_estimated_with_a_mean_of_0(uneven):
     options = brief(450, refine_every=50, lr_means=2e-3, background="black")
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
-    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR of training images
     found = np.array(corrected.log["exposures"])
     assert np.abs(found.mean(axis=0)).max() < 1e-4
     assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats represent the scene poorly

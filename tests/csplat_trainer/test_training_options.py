@@ -16,8 +16,7 @@ from csplat.errors import InputError
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs, TrainOptions
 from csplat_trainer.training_report import moving_average
-
-pytest.importorskip("numba", reason="requires the extra [render]")
+from csplat_trainer.tuning import FinetuneOptions
 
 
 @pytest.fixture
@@ -60,10 +59,24 @@ def test_learning_rates_decay_and_options_out_of_range_are_refused():
     shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
     assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)  # after refinement
     assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
-    wrong = {"max_splats": 0, "device": "mps", "sh_degree": 5, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
+    wrong = {
+        "max_splats": 0,
+        "device": "mps",
+        "sh_degree": 5,
+        "loss": "l2",
+        "lr_means": np.nan,
+        "lr_means_final": 1.0,
+        "engine": "gsplat",
+    }
     for name, value in wrong.items():
         with pytest.raises(InputError, match=r"expected|mps is not supported"):
             TrainOptions(**{name: value})
+
+
+@pytest.mark.parametrize("options", [TrainOptions, FinetuneOptions])
+def test_the_native_engine_is_refused_on_a_gpu(options):
+    with pytest.raises(InputError, match="engine is native, expected auto or torch with device cuda"):
+        options(device="cuda", engine="native")
 
 
 def test_growth_reaches_the_cap_halfway_and_sh_degrees_are_activated_one_by_one():

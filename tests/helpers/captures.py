@@ -56,7 +56,7 @@ def as_bytes(pixels):
 def training_images(make_model, *, alpha=True):
     """Return twelve images of thirty splats, nine of them for training."""
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
-    rasteriser, shots, K = Rasteriser(gradients=False), [], intrinsics(32, 32, 50.0)
+    rasteriser, shots, K = Rasteriser(), [], intrinsics(32, 32, 50.0)
     for elevation in (10.0, 45.0):
         for camera in orbit((0, 0, 0), 6.0, (0, 0, 1), 6, K, 32, 32, elevation=elevation):
             seen = rasteriser.forward(scene, camera)

@@ -5,10 +5,12 @@ import sys
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from importlib import import_module
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
 
+from csplat.errors import InputError
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.views import find_view_set
@@ -37,6 +39,13 @@ def refused(*words, status=1):
     assert result.exception is None or isinstance(result.exception, SystemExit)
     assert (1, True) == (result.stderr.count("\n"), result.stderr.startswith("error: ")), result.stderr
     return result.stderr
+
+
+def hide_renderer(monkeypatch):
+    """Let commands find no renderer; return the line with which they refuse."""
+    message = "this installation of csplat has no compiled renderer"
+    monkeypatch.setattr("csplat_tools.optional_packages.require_library", Mock(side_effect=InputError(message)))
+    return f"error: {message} (E_INPUT)\n"
 
 
 def status_of(*words):

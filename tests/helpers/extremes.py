@@ -286,7 +286,7 @@ def images(name, points=None):
 
 def images_of(model, views, points=None):
     """Return a data set of renders on black, three of four for training, and points."""
-    rasteriser, shots = Rasteriser(gradients=False), []
+    rasteriser, shots = Rasteriser(), []
     for camera in views:
         pixels = np.clip(rasteriser.forward(model, camera).rgb, 0.0, 1.0)
         shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))

@@ -5,7 +5,6 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from captures import cameras, shell
 
 from csplat import EncodeOptions
@@ -16,8 +15,6 @@ from csplat_tools.training import tuning_run
 from csplat_tools.views import ViewSet
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 BLACK = np.zeros(3, np.float32)
 QUICK = FinetuneOptions(iterations=30, warm_up=5, validate_every=10, log_every=5)

@@ -4,10 +4,7 @@ import struct
 import zlib
 
 import numpy as np
-import pytest
 from posed_sets import H, W
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)
 GREY = np.rint(255.0 * RAMP).astype(np.uint8)

@@ -68,10 +68,10 @@ def relative_error(value, wanted):
     return float(off / max(1e-30, float(np.linalg.norm(wanted))))
 
 
-def gradients_of(splats, view, weights, dtype=np.float64, **options):
-    rasteriser = Rasteriser(dtype=dtype)
+def gradients_of(splats, view, weights, **options):
+    rasteriser = Rasteriser()
     picture = rasteriser.forward(splats, view, **options)
-    return picture, rasteriser.backward(*(weight.astype(dtype) for weight in weights))
+    return picture, rasteriser.backward(*weights)
 
 
 def finite_differences(arrays, view, weights, **options):
@@ -93,20 +93,21 @@ def finite_differences(arrays, view, weights, **options):
     return picture, slopes
 
 
-def float32_errors(splats, view, weights, **options):
-    """Compare float32 gradients with float64 ones; return a number of pixels, and relative errors by parameter.
+def gradient_errors(arrays, view, weights, reference, **options):
+    """Compare gradients with those of a reference; return a number of pixels, and relative errors by parameter.
 
     If a comparison, such as alpha against 1/255, has another result in float32, a pixel gives one splat another
     gradient. For each such pixel the splat with the largest difference is left out.
     """
-    both = (gradients_of(splats, view, weights, dtype, **options) for dtype in (np.float32, np.float64))
-    pictures, found = zip(*both, strict=True)
-    flipped = int(np.count_nonzero(np.abs(pictures[0].rgb - pictures[1].rgb).max(2) > _FLIPPED))
+    picture, found = gradients_of(UncheckedSplats(**arrays), view, weights, **options)
+    exact, wanted = reference({name: a.astype(np.float64) for name, a in arrays.items()}, view, weights, **options)
+    flipped = int(np.count_nonzero(np.abs(picture.rgb - getattr(exact, "rgb", exact)).max(2) > _FLIPPED))
     errors = {}
     for group in GROUPS:
-        value, wanted = (np.asarray(getattr(one, group), np.float64).reshape(len(splats.means), -1) for one in found)
-        kept = np.argsort(np.square(value - wanted).sum(1))[: max(0, len(value) - flipped)]
-        errors[group] = relative_error(value[kept], wanted[kept])
+        value, target = (np.asarray(one, np.float64).reshape(len(arrays["means"]), -1)
+                         for one in (getattr(found, group), wanted[group]))  # fmt: skip
+        kept = np.argsort(np.square(value - target).sum(1))[: max(0, len(value) - flipped)]
+        errors[group] = relative_error(value[kept], target[kept])
     return flipped, errors
 
 

@@ -1,13 +1,10 @@
 """Helpers of the tests of rasteriser, which several files share."""
 
 import numpy as np
-import pytest
 from oracle import facing
 
 from csplat.model import SplatModel
 from csplat.spherical_harmonics import SH_C0
-
-pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 
 def camera(width=64, height=48, focal=60.0, distance=4.0):

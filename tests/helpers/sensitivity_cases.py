@@ -1,13 +1,10 @@
 """Helpers of the tests of sensitivity, which several files share."""
 
 import numpy as np
-import pytest
 from models import model_of
 
 from csplat.model import normalise_quats
 from csplat_render.camera import intrinsics, look_at
-
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 
 
 def small_scene(count=6, degree=2, seed=0, **fields):

@@ -193,8 +193,7 @@ def colmap_text_set(tmp_path):
 @pytest.fixture(scope="session")
 def captures():
     """The module captures.py, which trains and searches."""
-    for name in ("numba", "scipy"):
-        pytest.importorskip(name, reason="training and targets require the extra [render]")
+    pytest.importorskip("PIL", reason="training requires the extra [render]")
     return importlib.import_module("captures")
 
 

@@ -8,8 +8,6 @@ import pytest
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 SIZE = 32
 QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
 

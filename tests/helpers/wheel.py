@@ -1,13 +1,10 @@
-"""Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-0.1.0-py3-none-any.whl out/wheel`.
+"""Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-0.1.0-py3-none-linux_x86_64.whl out/wheel`.
 
 The folder then comes first on PYTHONPATH, so that tests see what users install, in the one environment that there is.
-Modification times follow from contents, so that bytecode stays valid. numba does not notice changes in callees of a
-kernel in other files, so each state of all kernels has a cache folder of its own; its name is printed.
+Modification times follow from contents, so that bytecode stays valid.
 """
 
-import hashlib
 import os
-import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -30,21 +27,8 @@ def unpack(wheel: Path, folder: Path) -> None:
     for package in PACKAGES:
         assert (folder / package / "__init__.py").exists(), f"{wheel} holds no package {package}"
     assert (folder / "csplat_program.py").exists(), f"{wheel} holds no entry point"
-
-
-def kernel_cache(folder: Path) -> Path:
-    """Return the folder for compiled kernels of these sources; kernels of other sources are removed."""
-    total = hashlib.sha256()
-    kernels = [path for package in ("csplat_render", "csplat_trainer") for path in (folder / package).rglob("*.py")]
-    for path in sorted([*kernels, folder / "csplat" / "spherical_harmonics.py"]):
-        total.update(path.read_bytes())
-    caches, name = folder.parent / "kernels", total.hexdigest()[:16]
-    for other in caches.glob("*"):
-        if other.name != name:
-            shutil.rmtree(other)
-    return caches / name
+    assert wheel.stem.endswith("-any") == (not list(folder.glob("csplat_render/native/csplat_native_*")))
 
 
 if __name__ == "__main__":
     unpack(Path(sys.argv[1]), Path(sys.argv[2]))
-    print(kernel_cache(Path(sys.argv[2]).absolute()))

@@ -33,5 +33,4 @@ def test_files_of_shared_scenes_have_the_recorded_bytes(data_dir):  # noqa: ARG0
 
 @pytest.mark.slow
 def test_reports_of_every_command_have_the_recorded_keys():
-    pytest.importorskip("numba", reason="renders require the extra [render]")
     check("keys")

@@ -145,7 +145,6 @@ def test_the_python_example_with_a_target_runs(sample_path, tmp_path, monkeypatc
 @pytest.mark.usefixtures("small_views")
 def test_the_tutorial_runs(tmp_path, monkeypatch):
     """Its commands run in order, with fewer and smaller images of a square, and fewer steps."""
-    pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(ROOT / "tools" / "lab" / "sample")
     text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")

@@ -23,8 +23,6 @@ from csplat_bench.subjects.engine_loaders import Trial
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 pytestmark = [pytest.mark.slow, pytest.mark.engines]
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")

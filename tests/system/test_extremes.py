@@ -32,8 +32,6 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_loop import fit_to_options, train
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_views")]
 QUALITIES = {None: None, 10.0: 12.0, 120.0: 44.0}  # attribute_psnr, and the least PSNR of renders, dB
 LONG = pytest.mark.long

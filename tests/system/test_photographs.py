@@ -1,7 +1,8 @@
-"""`csplat compare --data` and `csplat render --data`; both check their inputs before they compile."""
+"""`csplat compare --data` and `csplat render --data`; both check their inputs before they render."""
 
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,17 +12,14 @@ from command_line import call, invoke
 from PIL import Image
 from posed_sets import to_opengl, write_document
 
-from csplat import Context, EncodeOptions, encode, write_ply
+from csplat import EncodeOptions, encode, write_ply
 from csplat.errors import InputError
-from csplat.ply import read_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
 from csplat_tools.inspect.comparison import compare
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.posed_images import PosedImage, image_scorer
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 W, H = 64, 48
 
@@ -156,9 +154,9 @@ def test_masked_pixels_are_not_scored(scene):
 
 
 @pytest.mark.slow
-def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypatch):
-    for place in ("tools.cli.compare.prepare_renderer", "tools.cli.render.prepare_renderer", "render.warmup.warm_up"):
-        monkeypatch.setattr(f"csplat_{place}", lambda *_, **__: pytest.fail("compiled before the inputs were checked"))
+def test_an_invalid_input_is_reported_before_rendering(files, tmp_path, monkeypatch):
+    fail = Mock(side_effect=AssertionError("rendered before the inputs were checked"))
+    monkeypatch.setattr("csplat_render.rasteriser.Rasteriser.forward", fail)
     monkeypatch.chdir(tmp_path)
     for name, path in zip("AB", files, strict=True):
         (tmp_path / name).symlink_to(path)
@@ -180,13 +178,3 @@ def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypa
         done = invoke(*words.split())
         assert done.exit_code in (1, 2), (words, done.stdout, done.exception)
         assert message in done.stderr, words
-
-
-def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):
-    calls = []
-    save_cameras(tmp_path / "cameras.json", cameras(2))
-    views = find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0)
-    context = Context(progress=lambda stage, _: calls.append(stage))
-    compare(*files, views=views, prepare=lambda: calls.append("prepare"), context=context)
-    assert 1 == calls.count("prepare")
-    assert calls.index("prepare") < calls.index("comparing")

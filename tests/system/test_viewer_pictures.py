@@ -21,8 +21,6 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_builder import FittedLevelBuilder
 
-pytest.importorskip("numba", reason="pictures need the rasteriser: pip install 'csplat[render]'")
-
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 #: Well above the required 38 dB: leaving out all SH gives 33, 8-bit rounding alone 59.

@@ -5,8 +5,7 @@
     >>> compared = csplat_tools.compare("scene.ply", simple.model)  # doctest: +SKIP
 
 The commands call these functions. A *scene* is a `SplatModel`, or a file of either kind: a path, an open binary file,
-or bytes. Functions that render require the packages of the extra `render`, and raise an error without them. The names
-load their modules when first used.
+or bytes. Images and plots require the packages of the extra `render`. The names load their modules when first used.
 """
 
 from __future__ import annotations

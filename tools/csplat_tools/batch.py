@@ -46,6 +46,7 @@ from csplat.formats import formats
 from csplat.out_of_core.bucket_workers import open_client
 from csplat.remote_store import is_url
 from csplat.system import interrupts_held, split_words
+from csplat_render.kernels import thread_count
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import is_csplat, write_bytes
@@ -154,7 +155,7 @@ def run_batch(
     todo = deque(sorted(tasks, key=lambda task: -sizes.get(task, 0)))  # the largest first
     running: dict[Future[SceneResult], tuple[Any, Task]] = {}
     with nullcontext() if scheduler is None else open_client(scheduler) as client, _interrupts_noted() as interrupts:
-        new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker, (worker_context,))
+        new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker)
         idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
         try:
             while (todo or running) and not interrupts:
@@ -233,11 +234,8 @@ def _interrupts_noted() -> Iterator[list[int]]:
         raise KeyboardInterrupt
 
 
-def _begin_worker(context: Context) -> None:
-    """Prepare a worker process: it ignores interrupts, ends with its parent, and has the context's number of threads.
-
-    Sets NUMBA_NUM_THREADS unless it is set, and starts a thread that waits for the end of the parent.
-    """
+def _begin_worker() -> None:
+    """Prepare a worker process: it ignores interrupts, and a thread ends it when its parent has ended."""
 
     def end_with(parent: Any) -> None:
         """Wait for the end of the parent, then ask this process to clean up, and end it after `_CLEANUP_SECONDS`."""
@@ -246,7 +244,6 @@ def _begin_worker(context: Context) -> None:
         time.sleep(_CLEANUP_SECONDS)
         os._exit(_STATUS_ENDED)
 
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(context.thread_count))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it, too
     threading.Thread(target=end_with, args=[multiprocessing.parent_process()], daemon=True).start()
 
@@ -389,7 +386,8 @@ def run_scene(
                 done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)  # noqa: S603
                 status, out, err = done.returncode, done.stdout, done.stderr
             else:
-                status, out, err = _run_here(words)
+                with thread_count(context.thread_count):
+                    status, out, err = _run_here(words)
             lines = [line for line in err.splitlines() if line.strip()]
             result = replace(result, seconds=round(time.perf_counter() - begun, 3), remarks=tuple(lines))
             if status:

@@ -35,6 +35,7 @@ from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
 from csplat.scene import join_blocks
 from csplat.types import F32, I64, null_progress
+from csplat_render.kernels import thread_count
 from csplat_tools.optional_packages import require_renderer
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
@@ -111,7 +112,8 @@ class FittedLevelBuilder:
         if len(model) <= self.whole_splats:
             from csplat_tools.level_fitting import LevelFitter
 
-            return self._build_leaves(model, LevelFitter(_plain(model), context=context).fit, self.count)
+            with thread_count(context.threads):
+                return self._build_leaves(model, LevelFitter(_plain(model), context=context).fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
         for done, rows in enumerate(buckets):
@@ -137,9 +139,9 @@ class FittedLevelBuilder:
         from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
         fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, context=context)
-        return self._build_leaves(
-            splats, fitter.fit if scene_count <= self.fitted_splats else _merge_only, self._part_levels
-        )
+        fit = fitter.fit if scene_count <= self.fitted_splats else _merge_only
+        with thread_count(context.threads):
+            return self._build_leaves(splats, fit, self._part_levels)
 
     def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
@@ -160,7 +162,8 @@ class FittedLevelBuilder:
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
         fitter = LevelFitter(scene, is_part=True, context=context)
-        nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
+        with thread_count(context.threads):
+            nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -217,7 +220,7 @@ def choose_levels(count: int, options: EncodeOptions, levels: LevelCount) -> Fit
     """Return the builder of levels of detail for a scene of `count` splats, or `None` if the file gets none.
 
     Raises:
-        InputError: the number of levels is out of range, or the extra `render` is not installed.
+        InputError: the number of levels is out of range, or the renderer is not installed.
     """
     if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
         raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")

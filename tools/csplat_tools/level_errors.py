@@ -57,7 +57,7 @@ def measure_errors(
             children[node.parent].append(number)
     step = encoded.plan.parameters.lattice.step
     regions = np.empty((len(nodes), 2, 3))
-    rasteriser = Rasteriser(gradients=False, context=context)
+    rasteriser = Rasteriser(context=context)
     for number, node in enumerate(nodes):  # children come before their parents
         corners = [corner for tile in node.tiles for corner in tile.corners(step)]
         corners += [corner for child in children[number] for corner in regions[child]]

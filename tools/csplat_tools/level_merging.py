@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from csplat.encoder import covariance_entries, mean_axes
 from csplat.model import SplatModel
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64
-from csplat_render.kernels import kernel
+from csplat_render import kernels
+from csplat_render.neighbours import nearest_neighbours
 
 _NEIGHBOURS = 8  # with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long
 # Fraction of the splats that a pass keeps: three passes leave a quarter. With more passes, clumps of unmerged splats
@@ -33,7 +32,6 @@ _GROWTH = 0.5
 _OPACITY_MAX = 0.99  # alpha that renderers cap at
 _THINNEST = 1e-3  # least standard deviation, divided by the largest, so that a flat splat has an image from the side
 _SINGULAR = 1e-12  # least determinant of a covariance, divided by the product of its variances
-_TIE = 1e-9  # largest distance added between splats at one place, divided by the side of their node
 _BLOCK = 1 << 14  # edges at once, so that temporary arrays stay in the cache
 _AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # row and column of each entry of a covariance
 _VIEWS = (((0, 1), (0, 3, 1)), ((0, 2), (0, 4, 2)), ((1, 2), (1, 5, 2)))  # axes of an image, entries of its covariances
@@ -69,30 +67,10 @@ def _choose_pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
     """Return the rows of disjoint pairs of neighbours in the same node, the cheapest, at most `most`, [2, M]."""
     edges = _neighbours(splats.means, nodes)
     cheapest = np.argsort(_merge_costs(splats, edges), kind="stable")
-    partners = np.full(len(splats), -1)
-    _pair_up(edges, cheapest, most, partners)
+    partners = np.full(len(splats), -1, np.int64)
+    kernels.call("pair_up", edges, cheapest, len(cheapest), most, partners)
     first = np.flatnonzero(partners > np.arange(len(splats)))
     return np.stack([first, partners[first]])
-
-
-@kernel
-def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
-    """Pair the splats of the edges, in the given order, if neither has a partner; stop after `most` pairs.
-
-    Args:
-        edges: [2, M], rows of two splats.
-        order: [M], indices of edges.
-        most: largest number of pairs.
-        partners: [N], the row of each splat's partner, written here; -1 initially, and for splats without a partner.
-    """
-    count = 0
-    for edge in order:
-        if count == most:
-            break
-        i, j = edges[0, edge], edges[1, edge]
-        if partners[i] < 0 and partners[j] < 0:
-            partners[i], partners[j] = j, i
-            count += 1
 
 
 def _neighbours(means: F32, nodes: I64) -> I64:
@@ -106,19 +84,11 @@ def _neighbours(means: F32, nodes: I64) -> I64:
         [2, M] int64, the rows of both splats, the lower first; each edge once, ascending. M is 0 if each is alone.
     """
     by_node = np.argsort(nodes, kind="stable")
-    edge_keys = [np.zeros(0, np.int64)]
-    for rows in np.split(by_node, np.flatnonzero(np.diff(nodes[by_node])) + 1):
-        count = min(len(rows), _NEIGHBOURS + 1)
-        # The last coordinate tells splats at the same place apart. Otherwise, thousands of them would take minutes.
-        places = means[rows].astype(np.float64)
-        apart = _TIE * (float(np.ptp(places, axis=0).max()) or 1.0) * np.linspace(0.0, 1.0, len(rows))
-        places = np.column_stack([places, apart])
-        near = KDTree(places).query(places, k=count)[1].reshape(len(rows), count)
-        starts = np.repeat(rows, count)
-        ends = rows[near.reshape(-1)]
-        # One integer for both rows; a splat that is its own neighbour is left out.
-        edge_keys.append((np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))[starts != ends])
-    keys = np.sort(np.concatenate(edge_keys))
+    sizes = np.unique(nodes, return_counts=True)[1]
+    near = nearest_neighbours(means[by_node].astype(np.float64), _NEIGHBOURS, sizes)[0]
+    starts, k = np.nonzero(near >= 0)
+    ends, starts = by_node[near[starts, k]], by_node[starts]
+    keys = np.sort(np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))  # one integer for both rows
     return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(means)))
 
 

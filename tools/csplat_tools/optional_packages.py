@@ -1,4 +1,4 @@
-"""Import optional packages, or raise an error that names the extra; compile the renderer; describe the machine."""
+"""Load the renderer and optional packages, or raise an error with the remedy; describe the machine."""
 
 from __future__ import annotations
 
@@ -16,51 +16,18 @@ from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import missing_package
 from csplat.system import core_count
-from csplat_tools.console import note, progress_bar
+from csplat_render.kernels import require_library
 
 _SPIN_COUNT = "1000"  # see `_limit_spinning`
-_DATA_SETS = (
-    ("numba", None),
-    ("scipy", None),
-    ("PIL", "pillow"),
-)  # modules for reading and rendering images, with the name of the package if it differs
 
 
 def require_renderer() -> None:
-    """Import the package for rendering, to fail early.
+    """Load the renderer, to fail early.
 
     Raises:
-        InputError: numba is not installed.
+        InputError: it is not installed, or does not support this processor.
     """
-    _need("numba")
-
-
-def prepare_renderer(
-    *, quiet: bool, gradients: bool = False, simplify: bool = False, ssim: bool = False, lpips: bool = False
-) -> None:
-    """Compile the renderer, or load it from the cache; print a note if that takes long.
-
-    Args:
-        quiet: print nothing.
-        gradients: compile the gradients for training, too.
-        simplify: compile the functions for simplification, too, including gradients.
-        ssim: compile SSIM, too.
-        lpips: compile LPIPS, too.
-
-    Raises:
-        InputError: numba is not installed.
-    """
-    require_renderer()
-    from csplat_render.warmup import warm_up
-
-    kernel_calls = [_warm_up_adam] if simplify else []
-    with progress_bar(quiet=quiet) as progress:
-        progress("preparing the renderer", 0.0)
-        warm_up(
-            None if quiet else note, gradients=gradients or simplify, simplify=simplify, ssim=ssim, lpips=lpips,
-            kernel_calls=kernel_calls,
-        )  # fmt: skip
-        progress("preparing the renderer", 1.0)
+    require_library()
 
 
 def require_trainer(*, plots: bool = False) -> None:
@@ -108,23 +75,13 @@ def require_plots() -> None:
 
 
 def require_data_sets() -> None:
-    """Import the packages for reading data sets.
+    """Load what reads data sets.
 
     Raises:
-        InputError: a package is not installed.
+        InputError: the renderer, which straightens images, or pillow is not installed.
     """
-    for module, package in _DATA_SETS:
-        _need(module, package)
-
-
-def _warm_up_adam() -> None:
-    """Compile the kernels of a training step, by a step of few values."""
-    import numpy as np
-
-    from csplat_trainer.parameters import Parameters, adam_step
-
-    values = {"quats": np.zeros((0, 4), np.float32), "logits": np.zeros(1, np.float32)}
-    adam_step(Parameters.starting_at(values), values, dict.fromkeys(values, 0.0))
+    require_renderer()
+    require_images()
 
 
 def _need(module: str, package: str | None = None, *, extra: str = "render") -> None:
@@ -168,7 +125,7 @@ def _limit_spinning() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", _SPIN_COUNT)
 
 
-_PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "pillow")
+_PACKAGES = ("numpy", "deflate", "zstandard", "matplotlib", "pillow")
 
 
 def describe_machine(context: Context = DEFAULT_CONTEXT) -> dict[str, Any]:

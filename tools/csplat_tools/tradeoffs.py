@@ -215,7 +215,7 @@ def tradeoff(
 ) -> Tradeoff:
     """Encode a scene with each setting of a grid, and measure the files, as `csplat tradeoff` does.
 
-    Takes minutes with targets. Requires the packages of the render extra.
+    Takes minutes with targets.
 
     Args:
         scene: a model, or a file in any format but .csplat.

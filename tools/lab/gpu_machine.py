@@ -4,10 +4,11 @@
     python tools/lab/gpu_machine.py unpack pieces/1 work          # there: once for each of them
     python tools/lab/gpu_machine.py run work --seconds 450        # there: until its exit status is 0
 
-The machine needs this repository, Python with torch, numba, SciPy, Pillow and typer, and nvcc of torch's CUDA version,
-which compiles gsplat in a minute. Each `run` ends in time, and the next continues from checkpoints and finished files,
-in the folder work/bench/captures. `--suite captures_cpu` does the same without a GPU, at a quarter of the size. Files
-(.csplat with .json) may be copied into that folder of another machine, which scores them by the same suite.
+The machine needs this repository, with its renderer compiled by `python trainer/csplat_render/native/build.py`; Python
+with torch, Pillow and typer; and nvcc of torch's CUDA version, which compiles gsplat in a minute. Each `run` ends in
+time, and the next continues from checkpoints and finished files, in the folder work/bench/captures. `--suite
+captures_cpu` does the same without a GPU, at a quarter of the size. Files (.csplat with .json) may be copied into that
+folder of another machine, which scores them by the same suite.
 """
 
 from __future__ import annotations
@@ -105,7 +106,6 @@ def run_suite(work: Path, suite: str, only: Sequence[str], seconds: float) -> in
     """
     paths = [str(work / "site"), *(str(_ROOT / name) for name in _PACKAGES), os.environ.get("PYTHONPATH", "")]
     environment = {
-        "NUMBA_CACHE_DIR": str(work / "numba"),
         "TORCH_EXTENSIONS_DIR": str(work / "extensions"),
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, paths)),

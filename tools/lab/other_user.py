@@ -2,8 +2,7 @@
 
 For Linux, as root, by hand: `python tools/lab/other_user.py [COMMAND…]`. The commands run in a mount namespace of their
 own, so nothing is left on the machine. A command passes if it ends with status 0, or with an error in one line; a
-traceback, a raw message of a library or a file of an unexpected name fails. Without a cache every command that renders
-compiles its kernels, so all take a quarter of an hour.
+traceback, a raw message of a library or a file of an unexpected name fails.
 """
 
 import os
@@ -23,7 +22,7 @@ sys.path.append(str(ROOT / "tests" / "helpers"))
 import posed_sets  # noqa: E402
 
 NOBODY = "65534"  # user without a home
-SECONDS = 600  # wall time after which a command counts as hanging; kernels are compiled in each run
+SECONDS = 600  # wall time after which a command counts as hanging
 
 #: By command: its arguments, in a folder with a scene, a file of it, and a data set.
 COMMANDS = {
@@ -82,7 +81,7 @@ exec setpriv --reuid=$NOBODY --regid=$NOBODY --clear-groups \
     env -i PATH="$PREFIX/bin:/usr/bin:/bin" PYTHONUNBUFFERED=1 "$@"
 """
 
-_RAW = re.compile(r"Traceback|Matplotlib|Fontconfig|[Ww]arning|mkdir -p|\bNumba|site-packages|Exception ignored")
+_RAW = re.compile(r"Traceback|Matplotlib|Fontconfig|[Ww]arning|mkdir -p|site-packages|Exception ignored")
 
 
 def make_inputs(folder: Path) -> None:

@@ -1,14 +1,11 @@
-"""Render Gaussian splats: numba rasteriser with gradients, exact reference, GPU renderer, cameras, image metrics."""
+"""Render Gaussian splats: rasteriser with gradients, exact reference, GPU renderer, cameras, image metrics."""
 
 from __future__ import annotations
 
 import warnings
 from typing import TYPE_CHECKING, Literal, overload
 
-import numpy as np
-
 from csplat.context import DEFAULT_CONTEXT, Context
-from csplat.errors import missing_package
 from csplat.model import SplatModel
 from csplat_render.camera import Camera
 from csplat_render.conventions import Backend, Mode
@@ -97,7 +94,7 @@ def render(
         LimitError: too many large splats: more than `rasteriser.MAX_INTERSECTIONS`; or the scene exceeds the GPU's
             buffers.
     """
-    # Imported lazily: numba takes a second to import, and code that uses only cameras does not need it.
+    # The renderers are imported lazily, because code that uses only cameras does not need them.
     device = _find_device(backend)
     if device is not None:
         from csplat_render.gpu.renderer import GpuScene
@@ -107,17 +104,14 @@ def render(
     from csplat_render.gpu.renderer import PackedFile
 
     splats = model.read(sh_degree=sh_degree) if isinstance(model, PackedFile) else model
-    try:
-        from csplat_render.rasteriser import Rasteriser
-        from csplat_render.reference_rasteriser import render_exact
-    except ModuleNotFoundError as error:
-        raise missing_package(error) from None
+    from csplat_render.rasteriser import Rasteriser
+    from csplat_render.reference_rasteriser import render_exact
 
     if antialiased is None:
         antialiased = isinstance(splats, SplatModel) and splats.metadata.antialiased
     if mode == "exact":
         return render_exact(splats, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
-    rasteriser = Rasteriser(mode, np.float32, gradients=False, context=context)
+    rasteriser = Rasteriser(mode, context=context)
     return rasteriser.forward(splats, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
 
 

@@ -12,6 +12,7 @@ its transmittance below `TRANSMITTANCE_MIN`.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -127,14 +128,14 @@ class UncheckedSplats:
     shN: Array
 
 
-def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
-    """Convert the arrays to contiguous arrays of a dtype, and check their shapes."""
-    means = np.ascontiguousarray(splats.means, dtype)
+def checked_splats(splats: HasSplats) -> UncheckedSplats:
+    """Convert the arrays to C-contiguous arrays of float32, and check their shapes."""
+    means = np.ascontiguousarray(splats.means, np.float32)
     n = len(means) if means.ndim else 0
     shapes: dict[str, tuple[int, ...]] = {
         "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 3)
     }  # fmt: skip
-    arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*shapes, "shN")}
+    arrays = {name: np.ascontiguousarray(getattr(splats, name), np.float32) for name in (*shapes, "shN")}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise InputError(f"{name} has shape {list(arrays[name].shape)}, expected {list(shape)}")
@@ -155,12 +156,11 @@ def checked_degree(sh_degree: int | None, coefficient_count: int) -> int:
     return min(sh_degree, available)
 
 
-def checked_background(background: ArrayLike, dtype: Any) -> Array:
-    """Return a background as an array of three finite numbers."""
-    try:
-        colour = np.asarray(background, dtype)
-    except (TypeError, ValueError):
-        colour = np.zeros(0)
+def checked_background(background: ArrayLike) -> Array:
+    """Return a background as an array of three finite numbers, float32."""
+    colour: Array = np.zeros(0, np.float32)
+    with suppress(TypeError, ValueError):
+        colour = np.asarray(background, np.float32)
     if colour.shape != (3,) or not np.isfinite(colour).all():
         raise InputError(f"the background is {background!r}, expected red, green and blue")
     return colour

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.types import F32
+from csplat_render.metric_kernels import convolve
 
 #: Minimum width and height of an image, pixels: AlexNet's last layer would be empty for smaller images.
 MIN_SIZE = 31
@@ -98,9 +99,8 @@ class Lpips:
             raise InputError(f"LPIPS requires images of at least {MIN_SIZE}×{MIN_SIZE} pixels")
         distance = 0.0
         for a, b, head in zip(_features(reference, self), _features(image, self), self.heads, strict=True):
-            distance += float(
-                np.mean(np.square(_normalise_channels(a) - _normalise_channels(b)) @ head.astype(np.float64))
-            )
+            squares = np.square(_normalise_channels(a) - _normalise_channels(b)).mean(axis=(0, 1))
+            distance += float(np.sum(squares * head))  # no product of BLAS, the bits of which follow the processor
         return distance
 
 
@@ -216,8 +216,6 @@ def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
     Returns:
         [h, w, channels] each.
     """
-    from csplat_render.metric_kernels import convolve  # numba takes a second to import
-
     x: F32 = (np.clip(image.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
     features = []
     for (_, stride, padding, pooled), kernel, bias in zip(_LAYERS, weights.kernels, weights.biases, strict=True):

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.types import F32, F64, PSNR_CAP
+from csplat_render.metric_kernels import mean_ssim
 
 #: Minimum alpha of a covered pixel.
 COVERED_ALPHA = 0.5
@@ -143,12 +144,14 @@ def score_view(
     Raises:
         InputError: the images cannot be compared.
     """
-    squares = squared_error(reference, render)
+    pair = _clipped_pair(reference, render)
+    squares = _squared_difference(*pair)
     for name, pixels in (("cover", covered), ("mask", mask)):
         if pixels is not None and pixels.shape != squares.shape[:2]:
             raise InputError(f"the {name} has shape {list(pixels.shape)}, expected {list(squares.shape[:2])}")
     if mask is not None:
         reference, squares = np.where(mask[..., None], reference, render), squares[mask]
+        np.copyto(*pair, where=~mask[..., None])
         covered = None if covered is None else covered[mask]
     mse = float(np.mean(squares))
     inside = None if covered is None else squares[covered]
@@ -159,7 +162,7 @@ def score_view(
         psnr=psnr_of_mse(mse),
         covered_mse=float(np.mean(inside)) if inside is not None and len(inside) else None,
         cover=None if covered is None else float(np.mean(covered)),
-        ssim=ssim(reference, render) if with_ssim else None,
+        ssim=mean_ssim(*pair) if with_ssim else None,
         lpips=None if lpips is None else lpips(np.clip(reference, 0.0, 1.0), np.clip(render, 0.0, 1.0)),
     )
 
@@ -177,9 +180,7 @@ def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
 
 def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
     """Return the squared difference of two images, [H, W, 3] float64, both clipped to [0, 1]."""
-    a, b = _clipped_pair(reference, image)
-    result: F64 = (a - b) ** 2
-    return result
+    return _squared_difference(*_clipped_pair(reference, image))
 
 
 def psnr_of_mse(mean_squared_error: float) -> float:
@@ -196,8 +197,6 @@ def psnr(reference: NDArray[Any], image: NDArray[Any]) -> float:
 
 def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
     """Return the SSIM of two images, [H, W, 3] each; 1 if they are equal."""
-    from csplat_render.metric_kernels import mean_ssim  # numba takes a second to import
-
     return mean_ssim(*_clipped_pair(reference, image))
 
 
@@ -220,8 +219,15 @@ def _clipped_pair(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F6
             raise InputError(f"the {name} is {array.dtype}, expected floating values in 0 to 1")
     if reference.shape != image.shape:
         raise InputError(f"images of shapes {list(reference.shape)} and {list(image.shape)} cannot be compared")
-    a = np.clip(np.ascontiguousarray(reference, np.float64), 0.0, 1.0)
-    b = np.clip(np.ascontiguousarray(image, np.float64), 0.0, 1.0)
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise InputError("an image contains NaN")
+    a, b = (np.array(array, np.float64, order="C") for array in (reference, image))
+    for array in (a, b):
+        np.clip(array, 0.0, 1.0, out=array)
+        if math.isnan(array.min()):
+            raise InputError("an image contains NaN")
     return a, b
+
+
+def _squared_difference(a: F64, b: F64) -> F64:
+    """Return (a − b)², of the same shape."""
+    difference = a - b
+    return np.square(difference, out=difference)

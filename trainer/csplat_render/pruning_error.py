@@ -2,14 +2,13 @@
 
 It is exact for pruning a single splat, with two exceptions: a finished pixel stays finished, although it might continue
 without one of its splats (the omitted light has a transmittance of at most 1e-4 / (1 − alpha)); and renders are not
-clipped to 0..1. The equations are in `contributions`.
+clipped to 0..1. The equations are in `native/pruning.cpp`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +17,8 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.camera import Camera
-from csplat_render.contributions import Contributions
 from csplat_render.conventions import TRANSMITTANCE_MIN, Array
+from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import render_exact
 
 
@@ -50,7 +49,6 @@ def measure_pruning_error(
     cameras: Sequence[Camera],
     *,
     background: ArrayLike = (0.0, 0.0, 0.0),
-    dtype: Any = np.float32,
     transmittance_min: float = TRANSMITTANCE_MIN,
     context: Context = DEFAULT_CONTEXT,
     on_render: Callable[[Array], None] | None = None,
@@ -61,7 +59,6 @@ def measure_pruning_error(
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue of the background.
-        dtype: dtype of pixels, float32 or (for tests) float64.
         transmittance_min: transmittance at which a pixel is finished; 0: never.
         context: threads and progress.
         on_render: called with the render of each view, [H, W, 3].
@@ -72,11 +69,12 @@ def measure_pruning_error(
     """
     if not cameras:
         raise InputError("measuring the pruning error requires at least one camera")
-    contributions = Contributions(dtype, transmittance_min=transmittance_min, context=context)
-    error, seen, behind = np.zeros(len(model)), np.zeros(len(model), np.bool_), np.asarray(background, np.float64)
+    rasteriser = Rasteriser(transmittance_min=transmittance_min, context=context)
+    error, seen = np.zeros(len(model)), np.zeros(len(model), np.bool_)
     for number, camera in enumerate(cameras):
-        view = contributions.project_view(model, camera, antialiased=model.metadata.antialiased, basis=False)
-        render = contributions.measure_pruning(view, error, seen, background=behind)
+        render = rasteriser.measure_pruning(
+            model, camera, error, seen, background=background, antialiased=model.metadata.antialiased
+        )
         if on_render is not None:
             on_render(render)
         context.progress("measuring splats", (number + 1) / len(cameras))

@@ -1,31 +1,23 @@
-"""`Rasteriser`: render splats and compute gradients with respect to them on all threads of a CPU."""
+"""`Rasteriser`: render splats, and compute sums and gradients with respect to them, on all threads of a CPU.
+
+The passes are written in C++, see `native`.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import ctypes
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError, LimitError
-from csplat_render.binning import (
-    CHUNKS,
-    TILE,
-    count_tiles,
-    depth_order,
-    fill_tiles,
-    gather_by_depth,
-    record_offsets,
-    tile_starts,
-)
-from csplat_render.blending import RECORD, blend, blend_backward
+from csplat.types import F32, F64, I64, Mask
 from csplat_render.camera import Camera
 from csplat_render.conventions import (
-    ALPHA_CAP,
     Array,
     Gradients,
     HasSplats,
@@ -39,31 +31,105 @@ from csplat_render.conventions import (
     thresholds_of,
     view_vector,
 )
-from csplat_render.kernels import thread_count
-from csplat_render.projection import BLOCK, project, project_backward
+from csplat_render.kernels import address, call, create, destroy, thread_count
 
-#: Maximum number of pairs of splat and tile in one image; each takes 4 bytes, with gradients 52.
+#: Maximum number of pairs of splat and tile in one image; each takes 12 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
 
-_CHUNKS_OF_MANY_TILES = 2
-_MANY_TILES = 1 << 16  # tiles
+#: Names of the arrays that `Rasteriser.descend` changes, in the order of `UncheckedSplats`.
+FITTED = ("means", "quats", "scales", "logits", "sh0", "shN")
+
+
+class _Splats(ctypes.Structure):
+    """`Splats` of `native/renderer.h`."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("count", "degree", "coefficients", "logits")),
+        *((name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")),
+    ]
+
+
+class _View(ctypes.Structure):
+    """`View` of `native/renderer.h`."""
+
+    _fields_ = [
+        ("camera", ctypes.c_double * 24),
+        *((name, ctypes.c_double) for name in ("alpha_min", "transmittance_min")),
+        ("background", ctypes.c_double * 3),
+        *((name, ctypes.c_int64) for name in ("width", "height", "antialiased")),
+    ]
+
+
+class _Group(ctypes.Structure):
+    """`Group` of `native/gradients.cpp`."""
+
+    _fields_ = [*((name, ctypes.c_void_p) for name in ("values", "first", "second")), ("rate", ctypes.c_double)]
+
+
+class _Step(ctypes.Structure):
+    """`Step` of `native/gradients.cpp`."""
+
+    _fields_ = [
+        ("groups", _Group * len(FITTED)),
+        *((name, ctypes.c_double) for name in ("over_root", "beta2", "opacity_weight", "scale_weight")),
+        *((name, ctypes.c_void_p) for name in ("mean_sizes", "means2d")),
+    ]
 
 
 @dataclass(frozen=True, eq=False)
-class _ForwardState:
-    """Arguments and results of the last `forward`, for `backward`, which also reads the buffers that it filled."""
+class AdamStep:
+    """A step of Adam on splats, also on those that a view does not show, see `csplat_trainer.parameters.adam_step`.
+
+    Attributes:
+        values, first, second: the arrays by the names in `FITTED`, C-contiguous float32, changed in place; groups that
+            are absent are not fitted.
+        rates: learning rate of each group, divided by 1 − β1^step.
+        over_root: 1 / √(1 − β2^step).
+        beta2: β2.
+        opacity_weight: weight of the sum of opacities, a regulariser.
+        scale_weight: weight of the sum of standard deviations.
+        mean_sizes: [N] float32, factor of the step of each mean; `None`: 1.
+        means2d: [N] float32, written: the norms of `Gradients.means2d`; `None`: not needed.
+    """
+
+    values: Mapping[str, F32]
+    first: Mapping[str, F32]
+    second: Mapping[str, F32]
+    rates: Mapping[str, float]
+    over_root: float
+    beta2: float
+    opacity_weight: float = 0.0
+    scale_weight: float = 0.0
+    mean_sizes: F32 | None = None
+    means2d: F32 | None = None
+
+    def as_c(self) -> _Step:
+        """Return the step for the library."""
+        step = _Step()
+        for group, name in zip(step.groups, FITTED, strict=True):
+            if name in self.values:
+                group.values, group.first, group.second = (
+                    address(arrays[name]) for arrays in (self.values, self.first, self.second)
+                )
+                group.rate = self.rates[name]
+        for name in ("over_root", "beta2", "opacity_weight", "scale_weight"):
+            setattr(step, name, getattr(self, name))
+        step.mean_sizes, step.means2d = address(self.mean_sizes), address(self.means2d)
+        return step
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Splats that the renderer has projected: the arrays, and what the library is told about them and the view."""
 
     splats: UncheckedSplats
-    view: Array
-    degree: int
-    antialiased: bool
-    tiles_x: int
-    tile_count: int
+    c_splats: _Splats
+    c_view: _View
+    size: tuple[int, int]
+    radii: F32
+    drawn: int
     intersections: int
-    rgb: Array
-    transmittance: Array
-    depth: Array
-    radii: Array
+    ignored: int
 
 
 class Rasteriser:
@@ -72,31 +138,27 @@ class Rasteriser:
     Args:
         mode: `standard`; or `fast`, which omits alpha below 1.5/255 and light of a transmittance below 1/255. It takes
             a sixth of the time, with PSNRs of 40 to 52 dB on trained scenes.
-        dtype: dtype of pixels and gradients, float32 or (for tests) float64. Projection always uses float64.
-        gradients: enable `backward`; without it, `forward` is slightly faster.
+        transmittance_min: transmittance at which a pixel is finished; `None`: that of the mode.
         context: threads.
 
     Raises:
-        InputError: the mode or the dtype does not exist.
+        InputError: the mode does not exist, or the compiled library is missing.
     """
 
     def __init__(
         self,
         mode: Mode = "standard",
-        dtype: Any = np.float32,
         *,
-        gradients: bool = True,
+        transmittance_min: float | None = None,
         context: Context = DEFAULT_CONTEXT,
     ) -> None:
-        self._alpha_min, transmittance_min = thresholds_of(mode)
-        self.dtype = np.dtype(dtype)
-        if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise InputError(f"the rasteriser's dtype is {self.dtype}, expected float32 or float64")
-        self.gradients = gradients
+        self._alpha_min, least = thresholds_of(mode)
+        self._transmittance_min = least if transmittance_min is None else transmittance_min
         self.context = context
-        self._limits = np.array([self._alpha_min, ALPHA_CAP, transmittance_min], self.dtype)
-        self._buffers: dict[str, Array] = {}
-        self._last: _ForwardState | None = None
+        self._handle = create("renderer")
+        weakref.finalize(self, destroy, "renderer", self._handle)
+        self._last: _Projection | None = None
+        self._gradients: Gradients | None = None
 
     def forward(
         self,
@@ -106,7 +168,8 @@ class Rasteriser:
         background: ArrayLike = (0.0, 0.0, 0.0),
         antialiased: bool = False,
         sh_degree: int | None = None,
-        state: Array | None = None,
+        state: F32 | None = None,
+        logits: bool = False,
     ) -> RenderResult:
         """Render an image.
 
@@ -114,64 +177,48 @@ class Rasteriser:
         image of all splats, bit for bit.
 
         Args:
-            splats: the splats to render; arrays of another dtype are converted.
+            splats: the splats to render; arrays of another dtype are converted to float32.
             camera: the camera to render from.
             background: red, green, blue of the background.
             antialiased: compensate for the dilation by scaling opacities (mip-splatting).
             sh_degree: highest SH degree; `None`: the splats' own degree.
-            state: [H, W, 5], in the rasteriser's dtype, from `initial_state`, updated: the pixels after all slices so
-                far. `None`: there are no slices.
+            state: [H, W, 5] float32, from `initial_state`, updated: the pixels after all slices so far. `None`: there
+                are no slices.
+            logits: the opacities of the splats are logits.
 
         Returns:
             The image, in new arrays; for a slice, the image so far and the counts of the slice.
 
         Raises:
-            InputError: array shapes do not match, or a slice is rendered with gradients.
+            InputError: array shapes do not match.
             LimitError: there are more than `MAX_INTERSECTIONS`.
         """
-        arrays = checked_splats(splats, self.dtype)
-        degree = checked_degree(sh_degree, arrays.shN.shape[1])
-        colour = checked_background(background, self.dtype)
-        width, height = camera.W, camera.H
-        pixels = _checked_state(state, (height, width, 5), self.dtype)
-        if self.gradients and state is not None:
-            raise InputError("gradients require all splats at once, found a slice: use gradients=False")
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        tile_count = tiles_x * tiles_y
-        rgb = np.empty((height, width, 3), self.dtype)
-        transmittance, depth = np.empty((height, width), self.dtype), np.empty((height, width), self.dtype)
+        size = (camera.H, camera.W)
+        if state is not None and (state.shape != (*size, 5) or state.dtype != np.float32):
+            raise InputError(f"the state has shape {list(state.shape)}, expected {[*size, 5]} of float32")
         with thread_count(self.context.threads):
-            view, radii, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
-            shape, extent, box, near = (self._buffers[name] for name in ("shape", "extent", "box", "near"))
-            order = self._depth_order(near)
-            starts, intersections = self._sort_into_tiles(order, near, extent, box, tiles_x, tile_count)
-            blend(
-                starts, self._buffers["ids"], shape, box, tiles_x, self._limits, colour,
-                rgb, transmittance, depth, self._buffer("used", (tile_count,), np.int64), pixels,
-            )  # fmt: skip
-        result = RenderResult(rgb, 1 - transmittance, depth, radii, len(order), intersections, ignored)
-        if self.gradients:
-            self._last = _ForwardState(
-                arrays, view, degree, antialiased, tiles_x, tile_count, intersections, rgb.copy(), transmittance,
-                depth.copy(), radii,
-            )  # fmt: skip
-        return result
+            p = self._project(splats, camera, background, antialiased=antialiased, sh_degree=sh_degree, logits=logits)
+            rgb = np.empty((*size, 3), np.float32)
+            transmittance, depth = np.empty(size, np.float32), np.empty(size, np.float32)
+            call("render", self._handle, p.c_view, len(p.splats.means), state, rgb, transmittance, depth)
+        if state is not None:
+            self._last = None  # gradients require all splats at once
+        return RenderResult(rgb, 1 - transmittance, depth, p.radii, p.drawn, p.intersections, p.ignored)
 
-    def initial_state(self, camera: Camera) -> Array:
+    def initial_state(self, camera: Camera) -> F32:
         """Return the `state` of an image before its first slice."""
-        state = np.zeros((camera.H, camera.W, 5), self.dtype)
+        state = np.zeros((camera.H, camera.W, 5), np.float32)
         state[..., 0] = 1
         return state
 
     def find_visible(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
         """Find the splats that a render would show, and their depths. Takes the arguments of `forward`."""
-        arrays = checked_splats(splats, self.dtype)
-        degree = checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.context.threads):
-            *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
-        near, box = self._buffers["near"].copy(), self._buffers["box"]
-        tiles = np.where(near > 0, ((box[:, 1::2] - 1) // TILE - box[:, ::2] // TILE + 1).prod(axis=1), 0)
-        return VisibleSplats(near, tiles, ignored)
+            p = self._project(splats, camera, (0.0, 0.0, 0.0), antialiased=antialiased)
+            n = len(p.splats.means)
+            near, tiles = np.empty(n, np.float32), np.empty(n, np.int32)
+            call("visible", self._handle, n, near, tiles)
+        return VisibleSplats(near, tiles, p.ignored)
 
     def backward(
         self, grad_rgb: ArrayLike, grad_alpha: ArrayLike | None = None, grad_depth: ArrayLike | None = None
@@ -184,153 +231,164 @@ class Rasteriser:
             grad_depth: [H, W], gradient with respect to depth; `None`: 0.
 
         Raises:
-            InputError: there was no `forward`, or an array does not have the shape of its image.
+            InputError: there was no `forward` of all splats, or an array does not have the shape of its image.
         """
-        last = self._last
-        if last is None:
-            raise InputError("backward requires a forward with gradients=True before it")
-        size = last.transmittance.shape
-        g_rgb = _checked_gradient("grad_rgb", grad_rgb, (*size, 3), self.dtype)
-        g_alpha = _checked_gradient("grad_alpha", grad_alpha, size, self.dtype)
-        g_depth = _checked_gradient("grad_depth", grad_depth, size, self.dtype)
-        buffers, a = self._buffers, last.splats
-        n, k = a.shN.shape[:2]
-        records = self._buffer("records", (last.intersections, RECORD), self.dtype)
-        result = Gradients(
-            self._buffer("g_means", (n, 3), self.dtype),
-            self._buffer("g_quats", (n, 4), self.dtype),
-            self._buffer("g_scales", (n, 3), self.dtype),
-            self._buffer("g_opacities", (n,), self.dtype),
-            self._buffer("g_sh0", (n, 3), self.dtype),
-            self._buffer("g_shN", (n, k, 3), self.dtype),
-            self._buffer("g_means2d", (n,), self.dtype),
-            last.radii,
-        )
-        shape, box = self._buffer("shape", (n, 10), np.float64), self._buffer("box", (n, 4), np.int32)
+        last = self._last_projection()
+        g_rgb = _checked_gradient("grad_rgb", grad_rgb, (*last.size, 3))
+        g_alpha = None if grad_alpha is None else _checked_gradient("grad_alpha", grad_alpha, last.size)
+        g_depth = None if grad_depth is None else _checked_gradient("grad_depth", grad_depth, last.size)
+        a, old = last.splats, self._gradients
+        if old is None or old.shN.shape != a.shN.shape:
+            arrays = {name: np.empty_like(array) for name, array in vars(a).items()}
+            old = Gradients(**arrays, means2d=np.empty_like(a.opacities), radii=last.radii)
+        g = self._gradients = replace(old, radii=last.radii)
         with thread_count(self.context.threads):
-            blend_backward(
-                self._buffer("starts", (last.tile_count + 1,), np.int64),
-                self._buffer("used", (last.tile_count,), np.int64), buffers["ids"], buffers["slots"], shape, box,
-                last.tiles_x, self._limits, last.rgb, last.transmittance, last.depth,
-                g_rgb, g_alpha, g_depth, records,
+            call(
+                "gradients", self._handle, last.c_splats, last.c_view, g_rgb, g_alpha, g_depth,
+                g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.means2d,
             )  # fmt: skip
-            project_backward(
-                a.means, a.quats, a.scales, a.opacities, a.shN, last.degree, last.view, last.antialiased,
-                shape, self._buffer("near", (n,), np.float32), self._buffer("offsets", (n + 1,), np.int64),
-                records, buffers["record_tiles"], last.tiles_x,
-                result.means, result.quats, result.scales, result.opacities, result.sh0, result.shN, result.means2d,
-            )  # fmt: skip
-        return result
+        return g
+
+    def descend(self, step: AdamStep, gradient: F32) -> None:
+        """Make a step along the gradient of a loss; the values of the step were rendered by the last `forward`.
+
+        Args:
+            step: the step; `values` are the arrays that were rendered, with logits.
+            gradient: [H, W, 3], gradient of the loss with respect to the image.
+        """
+        last = self._last_projection()
+        assert last.c_splats.logits
+        self._step(last, step, None, _checked_gradient("the gradient", gradient, (*last.size, 3)))
+        self._last = None
+
+    def refit(
+        self,
+        splats: UncheckedSplats,
+        camera: Camera,
+        reference: F32,
+        step: AdamStep,
+        *,
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        antialiased: bool = False,
+    ) -> float:
+        """Make a step along the gradient of half the squared error of a render, in one pass over the image.
+
+        Render and reference are clipped to 0..1; the gradient passes through the clipping.
+
+        Args:
+            splats: the splats, C-contiguous float32, opacities as logits; with the arrays of the step.
+            camera, background, antialiased: as for `forward`.
+            reference: [H, W, 3].
+            step: the step.
+
+        Returns:
+            The sum of squared errors before the step.
+        """
+        target = _checked_gradient("the reference", reference, (camera.H, camera.W, 3))
+        with thread_count(self.context.threads):
+            p = self._project(splats, camera, background, antialiased=antialiased, logits=True, counts=False)
+        self._last = None
+        return self._step(p, step, target, None)
+
+    def measure_pruning(
+        self,
+        splats: HasSplats,
+        camera: Camera,
+        errors: F64,
+        seen: Mask,
+        *,
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        antialiased: bool = False,
+    ) -> F32:
+        """Measure the squared change of a render without each splat, and add it to sums; see `pruning_error`.
+
+        Args:
+            splats, camera, background, antialiased: as for `forward`.
+            errors: [N], incremented.
+            seen: [N], set for splats that are visible.
+
+        Returns:
+            [H, W, 3], the render.
+        """
+        rgb = np.empty((camera.H, camera.W, 3), np.float32)
+        with thread_count(self.context.threads):
+            p = self._project(splats, camera, background, antialiased=antialiased, counts=False)
+            call("measure_pruning", self._handle, p.c_view, len(p.splats.means), rgb, errors, seen)
+        self._last = None
+        return rgb
+
+    def add_derivatives(
+        self,
+        splats: HasSplats,
+        camera: Camera,
+        sums: Sequence[Array | None],
+        *,
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        antialiased: bool = False,
+    ) -> None:
+        """Add the derivatives of a render with respect to each splat to sums.
+
+        Args:
+            splats, camera, background, antialiased: as for `forward`.
+            sums: scratch and sums of `csplat_add_derivatives` in `native/sensitivity.cpp`.
+        """
+        with thread_count(self.context.threads):
+            p = self._project(splats, camera, background, antialiased=antialiased, counts=False)
+            call("add_derivatives", self._handle, p.c_splats, p.c_view, *sums)
+        self._last = None
 
     def _project(
-        self, splats: UncheckedSplats, camera: Camera, degree: int, *, antialiased: bool
-    ) -> tuple[Array, Array, int]:
-        """Project the splats into the buffers shape, extent, box and near, see `project`.
-
-        Returns:
-            [24], see `view_vector`; [N] float32, radii in pixels, see `RenderResult`; the number of ignored splats.
-        """
-        n, view = len(splats.means), view_vector(camera)
-        ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
-        project(
-            splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN, degree, view,
-            camera.W, camera.H, antialiased, self._alpha_min,
-            self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64),
-            self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32), radii, ignored,
-        )  # fmt: skip
-        return view, radii, int(ignored.sum())
-
-    def _depth_order(self, near: Array) -> Array:
-        """Return the indices [V] int32 of the drawn splats, nearest first; the next call overwrites them.
-
-        Args:
-            near: [N] float32, depths; 0 for splats that are not drawn.
-        """
-        n = len(near)
-        order = self._buffer("order", (n,), np.int32)
-        count = depth_order(
-            near,
-            self._buffer("keys", (n,), np.uint32),
-            self._buffer("order2", (n,), np.int32),
-            self._buffer("keys2", (n,), np.uint32),
-            order,
-        )
-        return order[:count]
-
-    def _sort_into_tiles(
-        self, order: Array, near: Array, extent: Array, box: Array, tiles_x: int, tile_count: int
-    ) -> tuple[Array, int]:
-        """Fill the buffers of splats by tile; with gradients, also the places of their records.
-
-        Args:
-            order: indices of the drawn splats, nearest first.
-            near: [N], depths.
-            extent: [N, 6], see `project`.
-            box: [N, 4], bounds on the screen, pixels.
-            tiles_x: tiles per row of the image.
-            tile_count: tiles of the image.
-
-        Returns:
-            [tile_count + 1], the first pair of each tile, and the end; number of pairs of splat and tile.
+        self,
+        splats: HasSplats,
+        camera: Camera,
+        background: ArrayLike,
+        *,
+        antialiased: bool,
+        sh_degree: int | None = None,
+        logits: bool = False,
+        counts: bool = True,
+    ) -> _Projection:
+        """Project the splats of a view; without `counts`, radii and ignored splats are left out.
 
         Raises:
-            LimitError: there are more than `MAX_INTERSECTIONS` pairs.
+            InputError: array shapes do not match.
+            LimitError: there are more than `MAX_INTERSECTIONS`.
         """
-        n = len(near)
-        chunks = CHUNKS if tile_count < _MANY_TILES else _CHUNKS_OF_MANY_TILES
-        counts = self._buffer("counts", (chunks, tile_count), np.int32)
-        starts = self._buffer("starts", (tile_count + 1,), np.int64)
-        touched = self._buffer("touched", (n if self.gradients else 0,), np.int32)
-        sorted_extent = self._buffer("sorted_extent", (len(order), 6), np.float64)
-        sorted_box = self._buffer("sorted_box", (len(order), 4), np.int32)
-        gather_by_depth(order, extent, box, sorted_extent, sorted_box)
-        count_tiles(order, sorted_extent, sorted_box, tiles_x, counts, touched)
-        total = tile_starts(counts, starts)
+        a = checked_splats(splats)
+        n, coefficients = a.shN.shape[:2]
+        degree = checked_degree(sh_degree, coefficients)
+        c_splats = _Splats(n, degree, coefficients, logits, *(address(array) for array in vars(a).values()))
+        colour = checked_background(background)
+        c_view = _View(
+            (ctypes.c_double * 24)(*view_vector(camera)), self._alpha_min, self._transmittance_min,
+            (ctypes.c_double * 3)(*colour), camera.W, camera.H, antialiased,
+        )  # fmt: skip
+        radii = np.empty(n if counts else 0, np.float32)
+        found: I64 = np.zeros(2, np.int64)
+        total = call("project", self._handle, c_splats, c_view, *((radii, found) if counts else (None, None)))
         if total > MAX_INTERSECTIONS:
             raise LimitError("MAX_INTERSECTIONS", total, MAX_INTERSECTIONS)
-        offsets = self._buffer("offsets", (n + 1 if self.gradients else 0,), np.int64)
-        if self.gradients:
-            record_offsets(near, touched, offsets)
-        slot_count = total if self.gradients else 0
-        fill_tiles(
-            order, sorted_extent, sorted_box, tiles_x, counts, starts,
-            self._buffer("ids", (total,), np.int32), offsets,
-            self._buffer("slots", (slot_count,), np.int32), self._buffer("record_tiles", (slot_count,), np.int32),
-        )  # fmt: skip
-        return starts, total
+        size = (camera.H, camera.W)
+        self._last = _Projection(a, c_splats, c_view, size, radii, int(found[0]), total, int(found[1]))
+        return self._last
 
-    def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any) -> Array:
-        """Return an array in the memory of a name, reused from call to call, and store it as `_buffers[name]`.
+    def _last_projection(self) -> _Projection:
+        """Return the last `forward`; raise an `InputError` if there is none, or it was a slice."""
+        if self._last is None:
+            raise InputError("gradients require a forward of all splats before them")
+        return self._last
 
-        Its values are the last ones in that memory; they are undefined after the memory grew, by at least a quarter, or
-        changed its dtype.
-        """
-        size = math.prod(shape)  # faster than np.prod
-        memory_name = name + "*"  # the memory itself, of which the array is a view
-        store = self._buffers.get(memory_name)
-        if store is None or store.size < size or store.dtype != dtype:
-            larger = 0 if store is None else store.size * 5 // 4
-            store = np.empty(max(size, larger), dtype)
-            self._buffers[memory_name] = store
-        view = store[:size].reshape(shape)
-        self._buffers[name] = view
-        return view
+    def _step(self, p: _Projection, step: AdamStep, reference: F32 | None, gradient: F32 | None) -> float:
+        """Make a step, and return the squared error, 0 without a reference."""
+        error = np.zeros(1)
+        with thread_count(self.context.threads):
+            call("step", self._handle, p.c_splats, p.c_view, reference, gradient, step.as_c(), error)
+        return float(error[0])
 
 
-def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Array:
-    """Return the state, empty for `None`; raise an `InputError` for another shape or dtype."""
-    if state is None:
-        return np.empty((0, 0, 5), dtype)
-    if state.shape != tuple(shape) or state.dtype != dtype:
-        raise InputError(f"the state has shape {list(state.shape)} of {state.dtype}, expected {list(shape)} of {dtype}")
-    return state
-
-
-def _checked_gradient(name: str, gradient: ArrayLike | None, shape: Sequence[int], dtype: Any) -> Array:
-    """Return a gradient, 0 for `None`, in a dtype; raise an `InputError` for another shape."""
-    if gradient is None:
-        return np.zeros(tuple(shape), dtype)
-    array = np.ascontiguousarray(gradient, dtype)
+def _checked_gradient(name: str, gradient: ArrayLike, shape: Sequence[int]) -> F32:
+    """Return a C-contiguous float32 array; raise an `InputError` for another shape."""
+    array = np.ascontiguousarray(gradient, np.float32)
     if array.shape != tuple(shape):
         raise InputError(f"{name} has shape {list(array.shape)}, expected {list(shape)}")
     return array

@@ -215,13 +215,13 @@ def renderer(
     """
     if not isinstance(model, SplatModel):
         return model.renderer(background, mode=mode, context=context)
-    # Imported lazily: numba takes a second to import, and code that uses only the classes does not need it.
+    # Imported lazily, because code that uses only the classes does not need them.
     from csplat_render.rasteriser import Rasteriser
     from csplat_render.reference_rasteriser import render_exact
 
     if mode == "exact":
         return lambda camera: render_exact(model, camera, background=background, antialiased=model.metadata.antialiased)
-    rasteriser = Rasteriser(mode, gradients=False, context=context)
+    rasteriser = Rasteriser(mode, context=context)
     return lambda camera: rasteriser.forward(
         model, camera, background=background, antialiased=model.metadata.antialiased
     )

@@ -3,7 +3,7 @@
     >>> import csplat_trainer
     >>> trained = csplat_trainer.train("capture")  # doctest: +SKIP
 
-The names load their modules on first use. `train` and `finetune` require numba, and gsplat on a GPU.
+The names load their modules on first use. `train` and `finetune` require gsplat on a GPU. The engines in torch,
 `torch_rasteriser`, the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat
 and splatfacto, require torch.
 """

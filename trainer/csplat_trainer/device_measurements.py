@@ -1,9 +1,9 @@
-"""Measure importance and pruning errors of a scene, exactly on the CPU or by estimates on a GPU."""
+"""What depends on the device: measurements, exact on the CPU or estimated on a GPU, and the rasteriser for torch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Importance
@@ -14,10 +14,7 @@ from csplat_render.camera import Camera
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-from csplat_trainer.training_options import MISSING_TORCH, Device
-
-if TYPE_CHECKING:
-    from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
+from csplat_trainer.training_options import Device
 
 
 def measure_importance(
@@ -45,7 +42,7 @@ def measure_importance(
             model, cameras, background=background, metric=True, magnitudes=False, context=context
         )
     else:
-        rasteriser = _make_rasteriser(model)
+        rasteriser = make_rasteriser(device, antialiased=model.metadata.antialiased)
         from csplat_trainer.gsplat_derivatives import estimate_sensitivity
 
         sensitivity = estimate_sensitivity(rasteriser, model, cameras, background, progress=context.progress)
@@ -65,16 +62,24 @@ def measure_pruning(
     """Measure the pruning error of each splat; arguments and errors as for `measure_importance`."""
     if device == "cpu":
         return measure_pruning_error(model, cameras, background=background, context=context)
-    rasteriser = _make_rasteriser(model)
-    from csplat_trainer.gsplat_derivatives import estimate_pruning, splats_of
+    rasteriser = make_rasteriser(device, antialiased=model.metadata.antialiased)
+    from csplat_trainer.gsplat_derivatives import estimate_pruning
 
-    return estimate_pruning(rasteriser, splats_of(rasteriser, model), cameras, background)
+    return estimate_pruning(rasteriser, model, cameras, background)
 
 
-def _make_rasteriser(model: SplatModel) -> GsplatRasteriser:
-    """Return a rasteriser on the GPU; raise an `InputError` if torch, gsplat or the GPU is absent."""
+def make_rasteriser(device: Device, *, antialiased: bool, context: Context = DEFAULT_CONTEXT) -> Any:
+    """Return the rasteriser for torch on a device, a `CpuRasteriser` or a `GsplatRasteriser`.
+
+    Raises:
+        InputError: torch, gsplat or the GPU is absent.
+    """
     try:
         from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
+        from csplat_trainer.torch_rasteriser import CpuRasteriser
     except ImportError:
-        raise InputError(MISSING_TORCH) from None
-    return GsplatRasteriser(antialiased=model.metadata.antialiased)
+        extra = "train" if device == "cpu" else "cuda"
+        raise InputError(f"torch is not installed (pip install 'csplat[{extra}]')") from None
+    if device == "cpu":
+        return CpuRasteriser(antialiased=antialiased, context=context)
+    return GsplatRasteriser(antialiased=antialiased)

@@ -13,21 +13,18 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.types import F32, null_progress
 from csplat_render.camera import Camera
 from csplat_render.conventions import UncheckedSplats
-from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.image_gains import ImageGain
 from csplat_trainer.losses import LossValue, PendingLoss, PerceptualLoss, SizedLosses
-from csplat_trainer.parameters import Parameters, adam_step, to_model
+from csplat_trainer.parameters import Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose
 from csplat_trainer.strategies import ScreenGradients, add_noise
 from csplat_trainer.training_options import TrainOptions
 
-_MAX_LOG_SCALE = 40.0  # largest log scale whose gradient Adam can square in float32
-
 
 class Engine(Protocol):
-    """A training engine, with numba kernels on the CPU or gsplat on a GPU."""
+    """A training engine, with compiled kernels on the CPU or gsplat on a GPU."""
 
     @property
     def parameters(self) -> Parameters:
@@ -61,7 +58,7 @@ class Engine(Protocol):
 
 
 class CpuEngine:
-    """A training engine in numba, which reuses its buffers.
+    """A training engine on the CPU, which reuses its buffers.
 
     Args:
         parameters: initial state; changed in place by `step`.
@@ -88,11 +85,10 @@ class CpuEngine:
         self._perceptual = perceptual
         self._context = replace(context, progress=null_progress)
         self._samples = options.strategy in ("mcmc", "fixed")  # Markov chain: noise and regularisers
-        self._rasteriser = Rasteriser("standard", np.float32, context=self._context)
+        self._rasteriser = Rasteriser(context=self._context)
         self._losses = SizedLosses(options.loss)
-        self._alphas = np.empty(0, np.float32)
-        self._logit_gradient = np.empty(0, np.float32)
         self._normals = np.empty((0, 3), np.float32)
+        self._radii = np.empty(0, np.float32)  # of the last render
 
     def step(
         self,
@@ -126,28 +122,17 @@ class CpuEngine:
             slope += self._perceptual.gradient(shown, target, options.lpips_weight)
         if gain is not None:
             slope = gain.backward(rgb, slope)
-        gradients = self._rasteriser.backward(slope)
         values, count = self.parameters.values, max(1, len(self.parameters))
-        _propagate_to_logits(
-            self._alphas,
-            gradients.opacities,
-            values["scales"],
-            gradients.scales,
-            np.float32(options.opacity_weight / count if self._samples else 0.0),
-            np.float32(options.scale_weight / (3 * count) if self._samples else 0.0),
-            self._logit_gradient,
+        norms = None if self.screen is None else np.empty_like(values["logits"])
+        step = self.parameters.next_step(
+            rates,
+            opacity_weight=options.opacity_weight / count if self._samples else 0.0,
+            scale_weight=options.scale_weight / (3 * count) if self._samples else 0.0,
+            means2d=norms,
         )
-        if self.screen is not None:
-            self.screen.add(_per_half_image(gradients.means2d, camera), gradients.radii > 0)
-        steps = {
-            "means": gradients.means,
-            "quats": gradients.quats,
-            "scales": gradients.scales,
-            "logits": self._logit_gradient,
-            "sh0": gradients.sh0,
-            "shN": gradients.shN,
-        }
-        adam_step(self.parameters, steps, rates)
+        self._rasteriser.descend(step, slope)
+        if self.screen is not None and norms is not None:
+            self.screen.add(_per_half_image(norms, camera), self._radii > 0)
         if self._samples and options.noise > 0.0:
             if self._normals.shape != values["means"].shape:
                 self._normals = np.empty_like(values["means"])
@@ -165,62 +150,16 @@ class CpuEngine:
         return measure_pruning_error(model, cameras, background=background, context=self._context)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the current state, [H, W, 3], for `backward`; sets the opacities, which `step` uses afterwards."""
+        """Render the current state, [H, W, 3], for `step`."""
         v = self.parameters.values
-        if len(self._alphas) != len(v["logits"]):
-            self._alphas, self._logit_gradient = np.empty_like(v["logits"]), np.empty_like(v["logits"])
-        _activate(v["logits"], self._alphas)
-        splats = UncheckedSplats(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
+        splats = UncheckedSplats(v["means"], v["quats"], v["scales"], v["logits"], v["sh0"], v["shN"])
         result = self._rasteriser.forward(
-            splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree
+            splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree, logits=True
         )
+        self._radii = result.radii
         return result.rgb
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:
     """Convert gradient norms [N] per pixel into norms per half an image, the unit of `grad_threshold`."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
-
-
-@parallel_kernel(relaxed=True)
-def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
-    """Compute opacities [N] from logits [N]; vectorises over splats."""
-    one = np.float32(1.0)
-    first, end = lane_range(lane, lanes, len(logits))
-    x, y = logits[first:end], alphas[first:end]
-    for i in range(len(x)):
-        y[i] = one / (one + np.exp(-x[i]))
-
-
-@parallel_kernel(relaxed=True)
-def _propagate_to_logits(
-    lane: int,
-    lanes: int,
-    alphas: F32,
-    by_alpha: F32,
-    scales: F32,
-    by_scale: F32,
-    opacity_weight: np.float32,
-    scale_weight: np.float32,
-    by_logit: F32,
-) -> None:
-    """Propagate gradients to logits, and add the gradients of both regularisers; vectorises over splats.
-
-    Args:
-        alphas: [N].
-        by_alpha: [N], gradient by opacity.
-        scales: [N, 3], logarithms.
-        by_scale: [N, 3], gradient by log-scale; the regulariser's is added.
-        opacity_weight: weight of the sum of opacities.
-        scale_weight: weight of the sum of standard deviations.
-        by_logit: [N], written.
-    """
-    first, end = lane_range(lane, lanes, len(alphas))
-    alphas, by_alpha, by_logit = alphas[first:end], by_alpha[first:end], by_logit[first:end]
-    scales, by_scale = scales[first:end], by_scale[first:end]
-    for i in range(end - first):
-        alpha = alphas[i]
-        by_logit[i] = (by_alpha[i] + opacity_weight) * alpha * (np.float32(1.0) - alpha)
-        if scale_weight > np.float32(0.0):
-            for k in range(3):
-                by_scale[i, k] += scale_weight * np.exp(min(scales[i, k], np.float32(_MAX_LOG_SCALE)))

@@ -27,8 +27,10 @@ from csplat.spherical_harmonics import sh_basis
 from csplat.types import F32, Progress
 from csplat_render.camera import Camera
 from csplat_render.pruning_error import PruningError
-from csplat_trainer.gsplat_rasteriser import GsplatRasteriser, SplatTensors, memory_errors
+from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
 from csplat_trainer.sensitivity import Sensitivity
+from csplat_trainer.torch_parameters import memory_errors, rotations, upload
+from csplat_trainer.torch_rasteriser import SplatTensors
 
 _DRAWS = 2  # random images per view
 _LARGEST_ALPHA = 0.998  # gsplat stops at 0.999
@@ -39,20 +41,21 @@ _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, x
 
 
 def estimate_pruning(
-    rasteriser: GsplatRasteriser, splats: SplatTensors, cameras: Sequence[Camera], background: F32
+    rasteriser: GsplatRasteriser, model: SplatModel, cameras: Sequence[Camera], background: F32
 ) -> PruningError:
     """Estimate `measure_pruning_error`.
 
     Args:
-        rasteriser: renders the views.
-        splats: the splats.
+        rasteriser: renders the views, antialiased as the scene.
+        model: the scene.
         cameras: the views.
         background: [3].
     """
+    splats = splats_of(model, rasteriser.device)
     derivatives = _EstimatedSquares(rasteriser, splats, background, matrices=False)
     for camera in cameras:
         derivatives.add(camera)
-    error = derivatives.opacity * splats.opacities.detach().double().square()
+    error = derivatives.opacity * splats.opacities.double().square()
     return PruningError(
         error.cpu().numpy(), (derivatives.views > 0).cpu().numpy(), sum(3 * camera.W * camera.H for camera in cameras)
     )
@@ -74,7 +77,7 @@ def estimate_sensitivity(
         background: [3].
         progress: progress callback.
     """
-    derivatives = _EstimatedSquares(rasteriser, splats_of(rasteriser, model), background, matrices=True)
+    derivatives = _EstimatedSquares(rasteriser, splats_of(model, rasteriser.device), background, matrices=True)
     for number, camera in enumerate(cameras):
         derivatives.add(camera)
         if progress is not None:
@@ -100,10 +103,9 @@ def estimate_sensitivity(
     )  # fmt: skip
 
 
-def splats_of(rasteriser: GsplatRasteriser, model: SplatModel) -> SplatTensors:
-    """Copy the splats of a scene to the device of a rasteriser."""
-    values = {name: rasteriser.upload(getattr(model, name)) for name in ("means", "quats", "scales", "sh0", "shN")}
-    return SplatTensors.of(values, rasteriser.upload(model.opacities))
+def splats_of(model: SplatModel, device: torch.device) -> SplatTensors:
+    """Copy the splats of a scene to a device."""
+    return SplatTensors(*(upload(getattr(model, name), device) for name in SplatTensors._fields))
 
 
 class _EstimatedSquares:
@@ -120,9 +122,9 @@ class _EstimatedSquares:
 
     def __init__(self, rasteriser: GsplatRasteriser, splats: SplatTensors, background: F32, *, matrices: bool) -> None:
         self._rasteriser, self._splats, self._matrices = rasteriser, splats, matrices
-        self._background = rasteriser.upload(background)
+        self._background = upload(background, rasteriser.device)
         self._generator = torch.Generator(rasteriser.device).manual_seed(_SEED)
-        count, functions = len(splats.means), splats.colours.shape[1]
+        count, functions = len(splats.means), 1 + splats.shN.shape[1]
         rows = count if matrices else 0
         self._degree = round(functions**0.5) - 1
         self._pairs = torch.triu_indices(functions, functions, device=rasteriser.device)
@@ -133,16 +135,15 @@ class _EstimatedSquares:
         self.basis = torch.zeros((rows, functions * (functions + 1) // 2), device=on)
         self.views = torch.zeros(count, dtype=torch.int64, device=on)
         self._triangle = _TRIANGLE.to(rasteriser.device)
-        with torch.no_grad():
-            self._covariances = _covariances(splats.quats, splats.scales)
+        self._covariances = _covariances(splats.quats, splats.scales.exp())
 
     @memory_errors()
     def add(self, camera: Camera) -> None:
         """Add the estimates of a view."""
         splats = self._splats
-        with torch.no_grad():
-            basis = self._basis_functions(camera)
-            colours = (torch.einsum("nk,nkc->nc", basis, splats.colours) + 0.5).clamp(min=0.0)
+        basis = self._basis_functions(camera)
+        coefficients = torch.cat([splats.sh0[:, None], splats.shN], dim=1)
+        colours = (torch.einsum("nk,nkc->nc", basis, coefficients) + 0.5).clamp(min=0.0)
         alphas = splats.opacities.clamp(max=_LARGEST_ALPHA)
         inputs = [
             tensor.detach().clone().requires_grad_() for tensor in (splats.means, self._covariances, alphas, colours)
@@ -191,7 +192,7 @@ class _EstimatedSquares:
 
     def _basis_functions(self, camera: Camera) -> Tensor:
         """Return the SH basis in the direction of each splat, [N, B]."""
-        offsets = self._splats.means.detach() - self._rasteriser.upload(camera.position.astype(np.float32))
+        offsets = self._splats.means - upload(camera.position.astype(np.float32), self._rasteriser.device)
         x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp(min=_SHORTEST)).unbind(dim=1)
         basis = offsets.new_empty(((self._degree + 1) ** 2, len(offsets)))
         sh_basis(self._degree, x, y, z, basis)
@@ -202,14 +203,3 @@ def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """Return the covariances of splats, [N, 3, 3], from quats [N, 4] and standard deviations [N, 3]."""
     axes = rotations(quats / quats.norm(dim=1, keepdim=True).clamp(min=_SHORTEST)) * scales[:, None]
     return axes @ axes.mT
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Return the rotation matrices of unit quaternions, [N, 3, 3]."""
-    w, x, y, z = quats.unbind(dim=1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from csplat.errors import InputError
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
+from csplat_render.neighbours import nearest_neighbours
 from csplat_trainer.parameters import ParameterArrays
 from csplat_trainer.posed_images import PosedImage
 
@@ -240,7 +240,6 @@ def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
     if len(points) < 2:
         return np.full(len(points), evenly)
     k = min(_NEIGHBOURS, len(points) - 1)
-    distances = KDTree(points).query(points, k + 1)[0][:, 1:]
-    spacing: F64 = np.sqrt(np.square(distances).mean(axis=1))
+    spacing: F64 = np.sqrt(np.square(nearest_neighbours(points, k)[1]).mean(axis=1))
     typical = float(np.median(spacing))
     return np.maximum(spacing, _SPACING_MIN * typical) if typical > 0.0 else np.where(spacing > 0.0, spacing, evenly)

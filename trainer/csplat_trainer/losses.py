@@ -18,6 +18,7 @@ LPIPS runs in torch, since the renderer's metric has no gradient; torch is impor
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -26,26 +27,13 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.types import F32, F64
+from csplat_render import kernels
 from csplat_render.camera import Camera
-from csplat_render.kernels import parallel_kernel
 from csplat_render.lpips import MIN_SIZE, SCALE, SHIFT, Lpips
-from csplat_render.metric_kernels import (
-    C1,
-    C2,
-    CHANNELS,
-    RADIUS,
-    WINDOW,
-    blur_across,
-    blur_down,
-    blur_products,
-    blur_twin,
-)
+from csplat_render.metric_kernels import C1, C2, blur_twin
 
 #: Weights of L1 and of 1 − SSIM, by the name of the option.
 LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}
-
-_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels are adjacent
-_TAPS = WINDOW[RADIUS:].astype(np.float32)  # weights of the window, from its middle outwards
 
 
 @dataclass(frozen=True)
@@ -78,7 +66,7 @@ class PendingLoss(Protocol):
 
 
 class PhotometricLoss:
-    """L1 + SSIM of images of one size; buffers are reused.
+    """L1 + SSIM of images of one size.
 
     Args:
         height, width: size of the images, pixels.
@@ -89,11 +77,6 @@ class PhotometricLoss:
     def __init__(self, height: int, width: int, l1_weight: float = 0.8, ssim_weight: float = 0.2) -> None:
         self.l1_weight, self.ssim_weight = float(l1_weight), float(ssim_weight)
         self._shape = (height, width, 3)
-        rows, row = height + 2 * RADIUS, 3 * width
-        self._across = np.zeros((5, rows, row), np.float32)  # blurred along the rows; zeros above and below
-        self._partial = np.zeros((3, height, row + 2 * _PAD), np.float32)  # zeros left and right
-        self._partial_across = np.zeros((3, rows, row), np.float32)
-        self._sums = np.zeros((height, 3), np.float64)
         self._gradient = np.empty(self._shape, np.float32)
 
     def __call__(self, rendered: F32, target: F32, mask: NDArray[np.bool_] | None = None) -> tuple[LossValue, F32]:
@@ -112,24 +95,19 @@ class PhotometricLoss:
         assert rendered.shape == self._shape == target.shape
         if mask is not None:
             np.copyto(target, rendered, where=~mask[..., None])
-        flat = (self._shape[0], 3 * self._shape[1])
-        x, y = rendered.reshape(flat), target.reshape(flat)
-        gradient = self._gradient.reshape(flat)
-        count = x.size
-        l1_step = np.float32(self.l1_weight / count)
-        if self.ssim_weight != 0.0:
-            blur_products(x, y, _TAPS, self._across)
-            _ssim_partials_and_sums(x, y, self._across, self._partial, self._sums)
-            _blur_partials(self._partial, self._partial_across)
-            _combine(x, y, self._partial_across, l1_step, np.float32(-self.ssim_weight / count), gradient)
-        else:
-            _l1_alone(x, y, l1_step, gradient, self._sums)
-        l1, ssim, mse = (float(value) / count for value in self._sums.sum(axis=0))
+        assert rendered.dtype == target.dtype == np.float32
+        (height, width, channels), gradient, count = self._shape, self._gradient, rendered.size
+        steps = self.l1_weight / count, -self.ssim_weight / count
+        sums = np.empty(3, np.float64)
+        kernels.call("photometric_loss", rendered, target, height, channels * width, *steps, gradient, sums)
+        l1, ssim, mse = (float(value) / count for value in sums)
+        if self.ssim_weight == 0.0:
+            ssim = math.nan  # not computed
         if mask is not None:
-            gradient.reshape(self._shape)[~mask] = np.float32(0.0)
+            gradient[~mask] = np.float32(0.0)
             mse /= float(np.mean(mask))
         loss = self.l1_weight * l1 + (self.ssim_weight * (1.0 - ssim) if self.ssim_weight != 0.0 else 0.0)
-        return LossValue(loss, l1, ssim, mse), self._gradient
+        return LossValue(loss, l1, ssim, mse), gradient
 
 
 class SizedLosses:
@@ -149,109 +127,6 @@ class SizedLosses:
         if size not in self._by_size:
             self._by_size[size] = PhotometricLoss(*size, *self._weights), np.empty((*size, 3), np.float32)
         return self._by_size[size]
-
-
-@parallel_kernel(relaxed=True)
-def _ssim_partials_and_sums(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
-    """Compute the derivatives of SSIM by its moments, and the sums of each row; vectorises over the values of a row.
-
-    Args:
-        x, y: [H, 3 W].
-        across: [5, H + 2 RADIUS, 3 W]; x, y, x², y², xy blurred along rows, from `blur_products`.
-        partial: [3, H, 3 W + 2 _PAD], written but for the margins; derivatives by the blurred x, x² (doubled) and xy.
-        sums: [H, 3], written; |x − y|, SSIM and (x − y)².
-    """
-    height, width = x.shape
-    # float32 constants: a Python float would widen the loop to float64
-    c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
-    moments = np.empty((5, width), np.float32)
-    for r in range(lane, height, lanes):
-        for f in range(5):
-            blur_down(across[f], r, _TAPS, moments[f])
-        mean_x, mean_y = moments[0], moments[1]
-        square_x, square_y, product = moments[2], moments[3], moments[4]
-        by_mean_row, by_square_row, by_product_row = partial[0, r], partial[1, r], partial[2, r]
-        ssim_sum, l1_sum, square_sum = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for i in range(width):
-            mx, my = mean_x[i], mean_y[i]
-            a = two * mx * my + c1
-            b = two * (product[i] - mx * my) + c2
-            c = mx * mx + my * my + c1
-            d = (square_x[i] - mx * mx) + (square_y[i] - my * my) + c2
-            over_cd = one / (c * d)
-            ssim = a * b * over_cd
-            by_square = -ssim / d
-            by_product = two * a * over_cd
-            by_mean = two * my * b * over_cd - two * mx * ssim / c - two * mx * by_square - my * by_product
-            by_mean_row[i + _PAD] = by_mean
-            by_square_row[i + _PAD] = two * by_square
-            by_product_row[i + _PAD] = by_product
-            difference = x[r, i] - y[r, i]
-            ssim_sum += ssim
-            l1_sum += abs(difference)
-            square_sum += difference * difference
-        sums[r, 0] = l1_sum
-        sums[r, 1] = ssim_sum
-        sums[r, 2] = square_sum
-
-
-@parallel_kernel(relaxed=True)
-def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
-    """Blur `partial` of `_ssim_partials_and_sums` along each row; vectorises over the values of a row.
-
-    `across` [3, H + 2 RADIUS, 3 W] is written but for the margins above and below.
-    """
-    for r in range(lane, partial.shape[1], lanes):
-        for f in range(3):
-            blur_across(partial[f, r], _TAPS, across[f, r + RADIUS])
-
-
-@parallel_kernel(relaxed=True)
-def _combine(
-    lane: int, lanes: int, x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32
-) -> None:
-    """Blur the derivatives across the rows, and combine the gradients of L1 and SSIM; vectorises over a row.
-
-    Args:
-        x, y: [H, 3 W].
-        across: [3, H + 2 RADIUS, 3 W], from `_blur_partials`.
-        l1_step: weight of L1 per value.
-        ssim_step: weight of SSIM per value, negative.
-        gradient: [H, 3 W], written.
-    """
-    height, width = x.shape
-    blurred = np.empty((3, width), np.float32)
-    for r in range(lane, height, lanes):
-        for f in range(3):
-            blur_down(across[f], r, _TAPS, blurred[f])
-        by_mean, by_square, by_product = blurred[0], blurred[1], blurred[2]
-        for i in range(width):
-            difference = x[r, i] - y[r, i]
-            ssim = by_mean[i] + x[r, i] * by_square[i] + y[r, i] * by_product[i]
-            gradient[r, i] = l1_step * np.sign(difference) + ssim_step * ssim
-
-
-@parallel_kernel(relaxed=True)
-def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
-    """Compute the gradient of L1, and the sums of each row; vectorises over the values of a row.
-
-    Args:
-        x, y: [H, 3 W].
-        l1_step: weight of L1 per value.
-        gradient: [H, 3 W], written.
-        sums: [H, 3], written; |x − y|, NaN in place of SSIM, and (x − y)².
-    """
-    height, width = x.shape
-    for r in range(lane, height, lanes):
-        l1_sum, square_sum = np.float32(0.0), np.float32(0.0)
-        for i in range(width):
-            difference = x[r, i] - y[r, i]
-            l1_sum += abs(difference)
-            square_sum += difference * difference
-            gradient[r, i] = l1_step * np.sign(difference)
-        sums[r, 0] = l1_sum
-        sums[r, 1] = np.nan  # not computed
-        sums[r, 2] = square_sum
 
 
 def photometric_loss_twin(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +15,16 @@ from numpy.typing import NDArray
 from csplat.model import SplatModel, normalise_quats
 from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32
-from csplat_render.kernels import parallel_kernel, relaxed_kernel
+from csplat_render import kernels
+from csplat_render.rasteriser import AdamStep
 
 ParameterArrays = dict[str, F32]
 
 #: Names of the arrays of `ParameterArrays`, in the order in which they are processed.
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
-_BETA1, _EPSILON = 0.9, 1e-15
-_TINY = 1e-30  # moments up to this become 0
-_SHORTEST = 1e-12  # least length of a quaternion that is normalised; shorter ones become the identity
+_BETA1 = 0.9  # decay of the mean of gradients in a step, as in native/adam.h
 _ALPHA_MARGIN = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
-_LOGIT_LIMIT = 14.0  # beyond, alpha has few digits in float32
-_BLOCK = 1 << 13  # values processed by a thread at a time
 
 
 @dataclass
@@ -61,6 +59,19 @@ class Parameters:
     def alphas(self) -> F32:
         """Opacities, [N]."""
         return sigmoid(self.values["logits"])
+
+    def next_step(self, rates: dict[str, float], **settings: Any) -> AdamStep:
+        """Count a step of Adam, and return it for a `Rasteriser`.
+
+        Args:
+            rates: learning rate of each group.
+            settings: further fields of `AdamStep`.
+        """
+        self.step += 1
+        correction = 1.0 - _BETA1**self.step
+        over_root = 1.0 / math.sqrt(1.0 - self.beta2**self.step)
+        corrected = {name: rates[name] / correction for name in self.values}
+        return AdamStep(self.values, self.first, self.second, corrected, over_root, self.beta2, **settings)
 
     def on_cpu(self) -> Parameters:
         """Return the state in arrays of NumPy: itself."""
@@ -131,8 +142,9 @@ def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatMode
 
 def sigmoid(logits: F32) -> F32:
     """Return the opacities of logits, computed in float64 and rounded once."""
-    alpha: F32 = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
-    return alpha
+    alphas = np.empty_like(logits)
+    kernels.call("sigmoid", logits.size, logits, alphas)
+    return alphas
 
 
 def logits_of(opacities: F32) -> F32:
@@ -150,82 +162,12 @@ def adam_step(parameters: Parameters, gradients: ParameterArrays, rates: dict[st
         gradients: gradients of the loss, shapes as `Parameters.values`.
         rates: learning rate of each group.
     """
-    parameters.step += 1
-    correction1 = 1.0 - _BETA1**parameters.step
-    correction2 = math.sqrt(1.0 - parameters.beta2**parameters.step)
-    for name, value in parameters.values.items():
-        if value.size:
-            _adam(
-                value.reshape(-1),
-                gradients[name].reshape(-1),
-                parameters.first[name].reshape(-1),
-                parameters.second[name].reshape(-1),
-                np.float32(rates[name] / correction1),
-                np.float32(1.0 / correction2),
-                np.float32(parameters.beta2),
-                np.float32(1.0 - parameters.beta2),
-            )
-    _constrain(parameters.values["quats"], parameters.values["logits"])
-
-
-@parallel_kernel(relaxed=True)
-def _adam(
-    lane: int,
-    lanes: int,
-    value: F32,
-    gradient: F32,
-    first: F32,
-    second: F32,
-    rate: np.float32,
-    over_root: np.float32,
-    b2: np.float32,
-    a2: np.float32,
-) -> None:
-    """Make a step of Adam; vectorises over the values.
-
-    Args:
-        value, first, second: [n], values and moments; changed in place.
-        gradient: [n].
-        rate: learning rate over 1 - β1^step.
-        over_root: 1 / √(1 - β2^step).
-        b2: β2.
-        a2: 1 - β2; a compiler that knew this might use a difference of squares, which is NaN for infinite ones.
-    """
-    b1, a1 = np.float32(_BETA1), np.float32(1.0 - _BETA1)
-    epsilon, tiny = np.float32(_EPSILON), np.float32(_TINY)
-    blocks = (value.shape[0] + _BLOCK - 1) // _BLOCK
-    for block in range(lane, blocks, lanes):
-        begin = block * _BLOCK
-        count = min(_BLOCK, value.shape[0] - begin)
-        p, g = value[begin : begin + count], gradient[begin : begin + count]
-        m, v = first[begin : begin + count], second[begin : begin + count]
-        for i in range(count):
-            slope = g[i]
-            mean = b1 * m[i] + a1 * slope
-            square = b2 * v[i] + a2 * slope * slope
-            # Moments of a splat that no image shows decay towards denormal numbers, which are slow.
-            mean = mean if abs(mean) > tiny else np.float32(0.0)
-            square = square if square > tiny else np.float32(0.0)
-            m[i] = mean
-            v[i] = square
-            p[i] -= rate * mean / (np.sqrt(square) * over_root + epsilon)
-
-
-@relaxed_kernel
-def _constrain(quats: F32, logits: F32) -> None:
-    """Normalise quats [N, 4], and clip logits [N] to ± `_LOGIT_LIMIT`, in place."""
-    limit = np.float32(_LOGIT_LIMIT)
-    for i in range(len(logits)):
-        logits[i] = min(max(logits[i], -limit), limit)
-    for i in range(quats.shape[0]):
-        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-        length = np.sqrt(w * w + x * x + y * y + z * z)
-        if length > np.float32(_SHORTEST):
-            over = np.float32(1.0) / length
-            quats[i, 0] = w * over
-            quats[i, 1] = x * over
-            quats[i, 2] = y * over
-            quats[i, 3] = z * over
-        else:
-            quats[i, 0] = np.float32(1.0)
-            quats[i, 1] = quats[i, 2] = quats[i, 3] = np.float32(0.0)
+    step = parameters.next_step(rates)
+    for name, value in step.values.items():
+        gradient = gradients[name]
+        assert gradient.shape == value.shape
+        assert gradient.dtype == value.dtype == np.float32
+        arrays = value, gradient, step.first[name], step.second[name]
+        kernels.call("adam", value.size, step.rates[name], step.over_root, step.beta2, *arrays)
+    quats, logits = parameters.values["quats"], parameters.values["logits"]
+    kernels.call("constrain_splats", len(quats), quats, len(logits), logits)

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.types import F32, F64, U8, Mask
+from csplat_render import kernels
 from csplat_render.camera import Camera
 from csplat_render.conventions import Mode
-from csplat_render.kernels import parallel_kernel
 from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
 from csplat_render.scorer import ReferenceImage, Scorer
 
@@ -127,7 +127,9 @@ def compose(image: PosedImage, background: F32, out: F32) -> F32:
     Returns:
         `out`, [H, W, 3] float32, overwritten.
     """
-    _compose(np.ascontiguousarray(image.pixels), background, out)
+    assert background.dtype == out.dtype == np.float32
+    pixels = np.ascontiguousarray(image.pixels)
+    kernels.call("compose", pixels, pixels[..., 0].size, pixels.shape[2], np.ascontiguousarray(background), out)
     return out
 
 
@@ -152,22 +154,6 @@ def halve(image: PosedImage) -> PosedImage:
     colours = ((alphas * four[..., :3]).sum(axis=0) + weights // 2) // np.maximum(weights, 1)
     pixels = np.concatenate([colours, (weights + 2) // 4], axis=2) if image.has_alpha else colours
     return PosedImage(smaller, np.ascontiguousarray(pixels, np.uint8), mask)
-
-
-@parallel_kernel()
-def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> None:
-    """Blend pixels [H, W, 3 or 4] with the background [3] into `out` [H, W, 3], 0..1; parallel over rows."""
-    over = np.float32(1.0 / 255.0)
-    for r in range(lane, pixels.shape[0], lanes):
-        for c in range(pixels.shape[1]):
-            if pixels.shape[2] == 4:
-                alpha = np.float32(pixels[r, c, 3]) * over
-                share = np.float32(1.0) - alpha  # weight of the background
-                for k in range(3):
-                    out[r, c, k] = alpha * (np.float32(pixels[r, c, k]) * over) + share * background[k]
-            else:
-                for k in range(3):
-                    out[r, c, k] = np.float32(pixels[r, c, k]) * over
 
 
 def image_scorer(

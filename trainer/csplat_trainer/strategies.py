@@ -22,8 +22,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from csplat.types import F32, F64, I64
+from csplat_render import kernels
 from csplat_render.camera import Camera
-from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.pruning_error import PruningError
 from csplat_trainer.parameters import Parameters
 from csplat_trainer.pruning import kept_in_round
@@ -143,38 +143,11 @@ def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
         strength: `noise` times the learning rate of the means.
         normals: [N, 3], standard normal numbers.
     """
-    v = parameters.values
-    _add_noise(v["means"], v["quats"], v["scales"], v["logits"], np.float32(strength), normals)
-
-
-@parallel_kernel()
-def _add_noise(
-    lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
-) -> None:
-    """Add noise to means [N, 3], as `add_noise`; parallel over runs of splats.
-
-    Splats above an opacity of `_GATE_OFF` are skipped, and means that would overflow stay.
-    """
-    logit_max = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
-    for i in range(*lane_range(lane, lanes, means.shape[0])):
-        if logits[i] > logit_max:
-            continue
-        alpha = 1.0 / (1.0 + math.exp(-logits[i]))
-        gate = strength / (1.0 + math.exp(-GATE_SLOPE * (1.0 - alpha - GATE_CENTRE)))
-        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-        r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-        r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-        r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-        n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
-        s0, s1, s2 = math.exp(scales[i, 0]), math.exp(scales[i, 1]), math.exp(scales[i, 2])
-        l0 = (r00 * n0 + r10 * n1 + r20 * n2) * min(gate * s0, MAX_NOISE) * s0
-        l1 = (r01 * n0 + r11 * n1 + r21 * n2) * min(gate * s1, MAX_NOISE) * s1
-        l2 = (r02 * n0 + r12 * n1 + r22 * n2) * min(gate * s2, MAX_NOISE) * s2
-        m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
-        m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
-        m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
-        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # huge splats may overflow float32
-            means[i, 0], means[i, 1], means[i, 2] = m0, m1, m2
+    # Splats above an opacity of `_GATE_OFF` are skipped, and means that would overflow float32 stay.
+    arrays = [parameters.values[name] for name in ("means", "quats", "scales", "logits")]
+    assert {np.dtype(np.float32)} == {array.dtype for array in (*arrays, normals)}
+    gate = float(strength), math.log(_GATE_OFF / (1.0 - _GATE_OFF)), GATE_SLOPE, GATE_CENTRE, MAX_NOISE
+    kernels.call("add_noise", len(parameters), *arrays, normals, *gate)
 
 
 _SPLIT_SIZE = 0.01  # fraction of the extent; larger splats are split, smaller ones cloned

@@ -4,7 +4,7 @@
 
 Each function repeats the operations of `csplat.encoder.quantisation`, in the same precision and order. PyTorch on a GPU
 multiplies by the reciprocal of a Python number that it is asked to divide by, so divisors are tensors. Values so large
-that a tile needs a coarser lattice are not covered; `GsplatTuning.free_values` finds them.
+that a tile needs a coarser lattice are not covered; `TorchTuning.free_values` finds them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from csplat.encoder import FixedQuantisation
-from csplat_trainer.gsplat_rasteriser import Tensors
+from csplat_trainer.torch_parameters import Tensors
 
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # √2, rounded to float64
 
@@ -34,8 +34,7 @@ class QuantisedValues:
         opacities: [N].
         sh0: [N, 3] Y, Co, Cg.
         sh: [R, K, 3] Y, Co, Cg of the R rows of SH.
-        decoded: means, quats, scales (log), sh0, shN by splat, float32.
-        alphas: [N], decoded.
+        splats: the decoded splats, float32; named as in `SplatTensors`.
     """
 
     scales: Tensor
@@ -44,8 +43,7 @@ class QuantisedValues:
     opacities: Tensor
     sh0: Tensor
     sh: Tensor
-    decoded: Tensors
-    alphas: Tensor
+    splats: Tensors
 
 
 class TorchQuantisers:
@@ -98,14 +96,15 @@ class TorchQuantisers:
         sh0 = self._colour_integers(values["sh0"], plan.sh0_step, None)
         sh = self._sh_integers(values["shN"])
         decoded_sh = self._lift_colours(sh, plan.sh_step)
-        decoded = {
+        splats = {
             "means": means.float(),
             "quats": self._dequantise_quats(turns),
             "scales": (by_splat.double() * plan.scale_step).float(),
+            "opacities": self._alphas[opacities],
             "sh0": self._lift_colours(sh0, plan.sh0_step),
             "shN": decoded_sh if self.sh_rows is None else decoded_sh[self.sh_rows],
         }
-        return QuantisedValues(scales, quats, sizes, opacities, sh0, sh, decoded, self._alphas[opacities])
+        return QuantisedValues(scales, quats, sizes, opacities, sh0, sh, splats)
 
     @torch.no_grad()
     def constrain(self, values: Tensors) -> None:

@@ -24,6 +24,7 @@ from csplat_render.kernels import thread_count
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
+from csplat_trainer.device_measurements import make_rasteriser
 from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import FitStep, Fitter
@@ -32,7 +33,7 @@ from csplat_trainer.losses import PendingLoss, PerceptualLoss
 from csplat_trainer.parameters import ParameterArrays, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
 from csplat_trainer.strategies import densify, grow, prune_least_needed, relocate, reset_opacities
-from csplat_trainer.training_options import MISSING_TORCH, Outputs, TrainOptions, TrainResult
+from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult, uses_torch
 from csplat_trainer.training_report import peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -56,7 +57,8 @@ def train(
 ) -> TrainResult:
     """Train splats on images, as `csplat train` does; requires the packages of the render extra.
 
-    The same images, options and library versions give the same splats on the same machine, at any number of threads.
+    With the native engine, the same images, options and library versions give the same splats on the same machine, at
+    any number of threads.
 
     Args:
         data: a data set, or its path for `load`: a folder, or a `transforms.json`.
@@ -414,18 +416,17 @@ def _load_lpips_weights(options: TrainOptions, outputs: Outputs) -> Lpips | None
 
 
 def _make_engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None, context: Context) -> Engine:
-    """Return the engine of the requested device.
+    """Return the requested engine.
 
     Raises:
         InputError: it does not support an option, or a package or the GPU is absent.
     """
-    if options.device == "cpu":
+    if not uses_torch(options.device, options.engine):
         perceptual = PerceptualLoss(lpips) if options.lpips_weight > 0.0 and lpips is not None else None
         return CpuEngine(parameters, options, perceptual, context=context)
     if options.lpips_weight > 0.0:
-        raise InputError("the perceptual loss requires --device cpu: omit --lpips-weight on other devices")
-    try:
-        from csplat_trainer.gsplat_engine import GsplatEngine
-    except ImportError:
-        raise InputError(MISSING_TORCH) from None
-    return GsplatEngine(parameters, options)
+        raise InputError("the perceptual loss requires the native engine: omit lpips_weight with torch")
+    rasteriser = make_rasteriser(options.device, antialiased=options.antialiased, context=context)
+    from csplat_trainer.torch_engine import TorchEngine
+
+    return TorchEngine(parameters, options, rasteriser)

@@ -18,14 +18,13 @@ Loss = Literal["inria", "study", "l1"]
 Init = Literal["auto", "points", "hull", "box"]
 Background = Literal["auto", "black", "white", "random"]
 Device = Literal["cpu", "cuda"]
+EngineName = Literal["auto", "native", "torch"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 LOSSES: tuple[Loss, ...] = get_args(Loss)
 INITS: tuple[Init, ...] = get_args(Init)
 BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 DEVICES: tuple[Device, ...] = get_args(Device)
-
-
-MISSING_TORCH = "device cuda: torch is not installed (pip install 'csplat[cuda]')"
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,8 @@ class TrainOptions:
         sh_degree: SH degree of the finished scene, 0 to 4.
         iterations: training steps, one image each.
         seed: seed of every random choice.
-        device: `cpu` (numba) or `cuda` (the gsplat package).
+        device: `cpu`, or `cuda`, a GPU with the gsplat package.
+        engine: `native` (compiled, on a CPU), `torch` (slower on a CPU), or `auto`: native on a CPU, torch on a GPU.
         strategy: strategy of adding and removing splats: `mcmc`, `fixed`, `gradient` or `none`.
         init: initial positions of splats: at the data set's `points`, inside the visual `hull` of the alpha masks,
             anywhere in the scene's `box`, or (`auto`) the first of these that is possible.
@@ -92,6 +92,7 @@ class TrainOptions:
     iterations: int = 7_000
     seed: int = 0
     device: Device = "cpu"
+    engine: EngineName = "auto"
     strategy: Strategy = "mcmc"
     init: Init = "auto"
     initial_splats: int = 0
@@ -130,6 +131,7 @@ class TrainOptions:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise InputError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
+        uses_torch(self.device, self.engine)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):
@@ -205,6 +207,17 @@ class TrainOptions:
         }
 
 
+def uses_torch(device: Device, engine: EngineName) -> bool:
+    """Return True if an engine in torch makes the steps.
+
+    Raises:
+        InputError: the engine does not run on the device.
+    """
+    if device != "cpu" and engine == "native":
+        raise InputError(f"engine is native, expected auto or torch with device {device}")
+    return device != "cpu" or engine == "torch"
+
+
 _GROWTH = 1.05  # growth factor of the MCMC paper
 _MAX_PRUNINGS = 10  # largest number of prunings
 _PRUNING_FRACTION = 0.6  # fraction of the steps after the end of the strategy over which prunings are spread
@@ -212,6 +225,7 @@ _LAST_EXPOSURE = 0.05  # final fraction of the learning rate of image gains
 
 _CHOICES = {
     "device": DEVICES,
+    "engine": ENGINES,
     "strategy": STRATEGIES,
     "init": INITS,
     "background": BACKGROUNDS,

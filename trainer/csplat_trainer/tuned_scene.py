@@ -11,8 +11,9 @@ mostly zero, unless the images oppose it. Frequencies are counted again every fe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.types import F32, I32, I64
 from csplat_render.conventions import Gradients
-from csplat_render.kernels import lane_range, parallel_kernel
-from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, logits_of, sigmoid
+from csplat_render.kernels import call, thread_count
+from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, logits_of
 
 
 class TunedScene:
@@ -41,42 +42,74 @@ class TunedScene:
     def __init__(self, fixed: FixedQuantisation, parameters: Parameters | None = None) -> None:
         self.fixed = fixed
         self.parameters = parameters or initial_parameters(fixed)
-        values, book, shapes = self.parameters.values, fixed.book, fixed.shapes
-        self._users = None if book is None else _group_by_entry(book.index, book.size)
-        self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
-        self._rows_gradient = np.zeros_like(values["shN"] if book else values["shN"][:0])
-        self._shape_users = None if shapes is None else _group_by_entry(shapes.index, shapes.size)
-        self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
+        book, shapes, shN = fixed.book, fixed.shapes, self.parameters.values["shN"]
+        self._tiles = _tile_table(fixed)
+        self._sh_rows = None if book is None else CodebookRows.of(book.index, book.size)
+        self._shape_rows = None if shapes is None else CodebookRows.of(shapes.index, shapes.size)
+        own, self._coarse = fixed.sh_coarseness(), np.zeros(len(shN), np.int32)
+        if own is not None:
+            self._coarse[len(shN) - len(own) :] = own
 
     @property
     def free_values(self) -> FreeValues:
         """The values for the encoder; all arrays except the opacities are the parameters' own."""
-        return self._free_values(sigmoid(self.parameters.values["logits"]))
+        return self._free_values(self.parameters.alphas)
 
     def _free_values(self, alphas: F32) -> FreeValues:
         """Return the parameters' own arrays, with these opacities [N] in place of the logits."""
         v = self.parameters.values
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
-    def dequantise(self) -> tuple[DecodedValues, F32]:
-        """Return the decoded values, and the opacities before quantisation."""
+    def dequantise(self) -> tuple[DequantisedScene, F32]:
+        """Return the decoded values, and the opacities before quantisation.
+
+        Values are those of `FixedQuantisation.dequantise`, bit for bit.
+        """
         values = self.free_values
-        return self.fixed.dequantise(values), values.opacities
+        with thread_count(self.fixed.encode_plan.context.threads):
+            seen = self._dequantise(values)
+        return seen or self._dequantise_unusual(values), values.opacities
 
-    def stream_values(self, seen: DecodedValues) -> StreamValues:
-        """Return the decoded contents of the file's streams."""
-        sh = self.fixed.dequantise_sh_rows(self.parameters.values["shN"]) if self.fixed.book is not None else seen.shN
-        if self.fixed.shapes is None:
-            return StreamValues(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
-        quats, scales, sizes = self.fixed.dequantise_shape_rows(self._free_values(seen.opacities), seen)
-        return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
+    def _dequantise(self, values: FreeValues) -> DequantisedScene | None:
+        """Return decoded values; `None` if some are too large for the kernels, or not finite."""
+        plan, tiles = self.fixed.parameters, self._tiles
+        stored = StreamValues(*(np.empty_like(getattr(values, field.name)) for field in fields(StreamValues)))
+        means, (rows, width, _) = np.empty_like(values.means), values.sh.shape
+        unusual = call(
+            "dequantise_splats", len(means), len(tiles), tiles, plan.opacity_levels, plan.chroma_shift,
+            values.means, values.opacities, values.sh0, means, stored.opacities, stored.sh0,
+        )  # fmt: skip
+        shared, shape_tiles = (0, tiles) if self.fixed.shapes is None else (self.fixed.shapes.size, tiles[:1])
+        unusual += call(
+            "dequantise_shapes", len(values.quats), shared, len(shape_tiles), shape_tiles, plan.quat_levels,
+            values.quats, values.scales, stored.quats, stored.scales,
+        )  # fmt: skip
+        if width:
+            steps = plan.sh_step, plan.chroma_shift, self._coarse
+            unusual += call("dequantise_sh", rows, width, *steps, values.sh, stored.sh)
+        if unusual:
+            return None
+        quats, scales, shN = stored.quats, stored.scales, stored.sh
+        if self._shape_rows is not None:
+            quats, scales = self._shape_rows.take(quats), self._shape_rows.take(scales)
+            call("add_sizes", len(means), plan.scale_step, values.sizes, scales, stored.sizes)
+        if self._sh_rows is not None:
+            shN = self._sh_rows.take(shN)
+        return DequantisedScene(means, quats, scales, stored.opacities, stored.sh0, shN, stored)
 
-    def count(self, seen: DecodedValues, weight: float) -> RateTerm:
+    def _dequantise_unusual(self, values: FreeValues) -> DequantisedScene:
+        """Return any decoded values, by the encoder."""
+        fixed, seen = self.fixed, self.fixed.dequantise(values)
+        sh = fixed.dequantise_sh_rows(values.sh) if fixed.book is not None else seen.shN
+        stored = StreamValues(*fixed.dequantise_shape_rows(values, seen), seen.opacities, seen.sh0, sh)
+        return DequantisedScene(**vars(seen), stored=stored)
+
+    def count(self, seen: DequantisedScene, weight: float) -> RateTerm:
         """Count the bits of the file's integers; `weight` is lambda, loss per bit and splat."""
-        return RateTerm.count(self.fixed, self.stream_values(seen), weight)
+        return RateTerm.count(self.fixed, seen.stored, weight)
 
     def step(
-        self, gradients: Gradients, seen: DecodedValues, alphas: F32, rates: dict[str, float], costs: RateTerm | None
+        self, gradients: Gradients, seen: DequantisedScene, alphas: F32, rates: dict[str, float], costs: RateTerm | None
     ) -> None:
         """Make a step against the gradients of the loss and the rate term.
 
@@ -86,50 +119,85 @@ class TunedScene:
             rates: learning rate of each group.
             costs: the rate term, if any.
         """
-        quats, scales, sizes = self._by_shape(gradients)
-        steps = {
-            "means": gradients.means,
-            "quats": quats,
-            "scales": scales,
-            "sizes": sizes,
-            "logits": gradients.opacities * (alphas * (np.float32(1.0) - alphas)),
-            "sh0": gradients.sh0,
-            "shN": self._by_row(gradients.shN),
-        }
-        if costs is not None:
-            costs.add_to(steps, self.stream_values(seen))
-        adam_step(self.parameters, steps, rates)
-        self.fixed.constrain(self._free_values(alphas))
+        with thread_count(self.fixed.encode_plan.context.threads):
+            quats, scales, sizes, shN = gradients.quats, gradients.scales, np.zeros(0, np.float32), gradients.shN
+            if self._shape_rows is not None:
+                sizes = scales[:, 0] + scales[:, 1] + scales[:, 2]  # offsets of all three log-scales
+                quats, scales = self._shape_rows.sum(quats), self._shape_rows.sum(scales)
+            if self._sh_rows is not None:
+                shN = self._sh_rows.sum(shN)
+            logits = gradients.opacities * (alphas * (np.float32(1.0) - alphas))
+            steps = {"means": gradients.means, "quats": quats, "scales": scales, "logits": logits}
+            steps |= {"sh0": gradients.sh0, "shN": shN, "sizes": sizes}
+            if costs is not None:
+                costs.add_to(steps, seen.stored)
+            adam_step(self.parameters, steps, rates)
+            self._constrain()
 
-    def _by_row(self, by_splat: F32) -> F32:
-        """Return the gradients of the file's rows of SH, [R, K, 3], given the gradients of all splats [N, K, 3].
+    def _constrain(self) -> None:
+        """Restrict the values as `FixedQuantisation.constrain`."""
+        fixed, values = self.fixed, self.parameters.values
+        means, quats, sh, zero = values["means"], values["quats"], values["shN"], fixed.zero
+        boxes = fixed.low, fixed.high, means
+        call("constrain_values", len(means), *boxes, len(quats), quats, 0 if zero is None else zero.size, zero, sh)
+        if self._shape_rows is not None:
+            values["sizes"][self._shape_rows.escaped] = 0.0
 
-        With a codebook, rows are its entries, then the escaped splats, and the next call overwrites the result.
-        Without, rows are splats.
-        """
-        book = self.fixed.book
-        if book is None or self._users is None:
-            return by_splat
-        rows, (order, starts) = self._rows_gradient, self._users
-        rows[: book.size] = _sum_by_entry(by_splat, order, starts, book.size)
-        rows[book.size :] = by_splat[self._escaped]
-        return rows
 
-    def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
-        """Return the gradients of the file's rotations [S, 4] and scales [S, 3], and of the sizes of splats.
+def _tile_table(fixed: FixedQuantisation) -> NDArray[np.float64]:
+    """Return the steps of each tile, [T, 7] float64, as `Tile` of native/quantisers.cpp.
 
-        With a shape codebook, rows are its entries, then the escaped splats, and sizes are offsets [N] of all three
-        log-scales. Without, S is N, and there are no sizes: [0].
-        """
-        shapes = self.fixed.shapes
-        if shapes is None or self._shape_users is None:
-            return gradients.quats, gradients.scales, np.zeros(0, np.float32)
-        own, (order, starts) = self._own_shape, self._shape_users
-        quats, scales = (
-            np.concatenate([_sum_by_entry(part, order, starts, shapes.size), part[own]])
-            for part in (gradients.quats, gradients.scales)
+    Columns: first row of the tile, steps of means and scales, multiples of quats and opacities, step of colours, 1 if
+    the encoder quantises these in float64.
+    """
+    plan = fixed.parameters
+    return np.array([
+        (
+            tile.rows[0],
+            math.ldexp(plan.lattice.step, tile.exponent),
+            math.ldexp(plan.scale_step, tile.factors.scales),
+            tile.factors.quats,
+            tile.factors.opacities,
+            math.ldexp(plan.sh0_step, tile.factors.sh0),
+            tile.factors.sh0 > 0,
         )
-        return quats, scales, gradients.scales.sum(axis=1)
+        for tile in fixed.encode_plan.tiles
+    ], np.float64)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CodebookRows:
+    """The rows of a codebook's values, which are its entries, then the escaped splats.
+
+    Attributes:
+        row: [N], row of each splat.
+        starts: [R + 1], number of splats of the rows before each row.
+        escaped: escaped splats.
+    """
+
+    row: I64
+    starts: I64
+    escaped: I64
+
+    @classmethod
+    def of(cls, index: NDArray[np.int32], size: int) -> CodebookRows:
+        """Return the rows of splats with these entries, [N]; `size`, the number of entries, for escaped splats."""
+        row, escaped = index.astype(np.int64), np.flatnonzero(index == size)
+        row[escaped] += np.arange(len(escaped))
+        starts = np.append(0, np.cumsum(np.bincount(row, minlength=size + len(escaped))))
+        return cls(row, starts.astype(np.int64), escaped)
+
+    def take(self, rows: F32) -> F32:
+        """Return the values [N, ...] of all splats, given those of the rows [R, ...]."""
+        out = np.empty((len(self.row), *rows.shape[1:]), np.float32)
+        call("take_rows", len(out), rows[0].size, self.row, rows, out)
+        return out
+
+    def sum(self, values: F32) -> F32:
+        """Return the sums of values [N, ...] over the splats of each row, [R, ...], in their order."""
+        out = np.empty((len(self.starts) - 1, *values.shape[1:]), np.float32)
+        call("sum_by_row", len(values), values[0].size, self.row, values, len(out), self.starts, out)
+        return out
 
 
 def initial_parameters(fixed: FixedQuantisation) -> Parameters:
@@ -148,55 +216,7 @@ def initial_parameters(fixed: FixedQuantisation) -> Parameters:
     )
 
 
-def _group_by_entry(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
-    """Group splats by their entry of a codebook.
-
-    Args:
-        index: [N], entry of each splat; `size` for escaped splats.
-        size: number of entries.
-
-    Returns:
-        [N], splats sorted by entry, escaped splats last; and [size + 1], position there of the first splat of each
-        entry, and of the first escaped splat.
-    """
-    order = np.argsort(index, kind="stable")
-    starts = np.searchsorted(index[order], np.arange(size + 1))
-    return order.astype(np.int64), starts.astype(np.int64)
-
-
-def _sum_by_entry(values: F32, order: I64, starts: I64, size: int) -> F32:
-    """Return the sums of values [N, ...] over the splats of each entry, [size, ...]; see `sum_by_entry`."""
-    flat = np.empty((size, values[0].size), np.float32)
-    sum_by_entry(values.reshape(len(values), -1), order, starts, flat)
-    return flat.reshape(size, *values.shape[1:])
-
-
-@parallel_kernel()
-def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, out: F32) -> None:
-    """Sum the rows of the splats of each entry, in float32 and in their order; vectorises over a row.
-
-    Args:
-        values: [N, C].
-        order: [N], rows of `values` by entry.
-        starts: [size + 1], index in `order` of an entry's first splat.
-        out: [size, C], overwritten.
-    """
-    for entry in range(lane, out.shape[0], lanes):
-        total = out[entry]
-        total[:] = np.float32(0.0)
-        for position in range(starts[entry], starts[entry + 1]):
-            row = values[order[position]]
-            for c in range(out.shape[1]):
-                total[c] += row[c]
-
-
-def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
-    """Compute `sum_by_entry` in NumPy, for tests."""
-    for entry in range(len(out)):
-        out[entry] = values[order[starts[entry] : starts[entry + 1]]].sum(axis=0)
-
-
-MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
+MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this; as in native/quantisers.cpp
 _ROWS = 1 << 15  # rows of SH to count at a time; their integers take several times the memory of the values
 _MAX_SLOPE = 4.0  # bits per step; frequencies of rare integers are too uncertain for larger slopes
 _FRACTION_MIN = 1e-12  # fraction; avoids log(0), whose weight is 0
@@ -214,6 +234,13 @@ class StreamValues:
     opacities: F32
     sh0: F32
     sh: F32
+
+
+@dataclass(frozen=True, eq=False)
+class DequantisedScene(DecodedValues):
+    """Decoded values by splat, and the contents of the file's streams."""
+
+    stored: StreamValues
 
 
 @dataclass(eq=False)
@@ -279,24 +306,28 @@ class RateTerm:
             stored: contents of the streams.
         """
         plan, tables = self.fixed.parameters, self.tables
-        per_bit = np.float32(self.weight / len(stored.opacities))
-        shift = plan.chroma_shift
+        per_bit, shift = self.weight / len(stored.opacities), plan.chroma_shift
         for number, grade in enumerate(_class_steps(self.fixed)):
             rows = grade.rows
             scales, quats, opacities, sh0 = (
                 tables[_table_name(name, number)] for name in ("scales", "quats", "opacities", "sh0")
             )
-            _add_plain(stored.scales[rows], grade.scale_step, 0, scales, per_bit, steps["scales"][rows])
-            _add_plain(stored.quats[rows], grade.quat_step, 1, quats, per_bit, steps["quats"][rows])
-            roots = np.sqrt(stored.opacities[rows])
-            levels = np.minimum(np.rint(roots * np.float32(grade.levels)), MAX_INTEGER).astype(np.int64)
-            # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
-            chain = np.float32(0.5 * grade.levels) * roots * (np.float32(1.0) - stored.opacities[rows])
-            steps["logits"][rows] += per_bit * chain * opacities[0][MAX_INTEGER + levels]
-            _add_colour(stored.sh0[rows, None], grade.sh0_step, shift, sh0, per_bit, steps["sh0"][rows, None])
-        _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
-        if stored.sh.shape[1]:
-            _add_colour(stored.sh, plan.sh_step, shift, tables["shN"], per_bit, steps["shN"])
+            _add_slopes(stored.scales[rows], grade.scale_step, per_bit, scales, steps["scales"][rows])
+            _add_slopes(stored.quats[rows], grade.quat_step, per_bit, quats, steps["quats"][rows])
+            alphas, logits = stored.opacities[rows], steps["logits"][rows]
+            call("add_opacity_slopes", len(alphas), grade.levels, per_bit, opacities, alphas, logits)
+            colours = stored.sh0[rows], steps["sh0"][rows]
+            call("add_colour_slopes", len(alphas), 1, grade.sh0_step, shift, per_bit, sh0, *colours)
+        _add_slopes(stored.sizes[:, None], plan.scale_step, per_bit, tables["sizes"], steps["sizes"][:, None])
+        rows, width, _ = stored.sh.shape
+        if width:
+            call("add_colour_slopes", rows, width, plan.sh_step, shift, per_bit, tables["shN"], stored.sh, steps["shN"])
+
+
+def _add_slopes(seen: F32, step: float, per_bit: float, table: F32, gradients: F32) -> None:
+    """Add the slopes of columns that are quantised one by one, the last of `seen` [n, C], to `gradients` [n, C]."""
+    rows, width = seen.shape
+    call("add_slopes", rows, width, width - len(table), step, per_bit, table, seen, gradients)
 
 
 @dataclass(frozen=True)
@@ -393,65 +424,3 @@ def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
 def _integers(seen: F32, step: float) -> I32:
     """Return the integers of decoded values of any shape, limited to ± `_INTEGER_LIMIT`."""
     return np.rint(np.clip(seen.astype(np.float64) / step, -_INTEGER_LIMIT, _INTEGER_LIMIT)).astype(np.int32)
-
-
-@parallel_kernel()
-def _add_plain(
-    lane: int, lanes: int, seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32
-) -> None:
-    """Add the slopes of columns that are quantised one by one; parallel over runs of rows.
-
-    Args:
-        seen: [n, C], decoded values.
-        step: their quantisation step.
-        first: number of columns to skip, which have no table.
-        tables: [C - first, 2 · MAX_INTEGER + 1], slopes in bits per step.
-        per_bit: loss per bit.
-        out: [n, C], gradients of the loss; incremented.
-    """
-    reach = tables.shape[1] // 2
-    over = np.float32(1.0 / step)
-    begin, end = lane_range(lane, lanes, seen.shape[0])
-    seen, out = seen[begin:end], out[begin:end]
-    for i in range(end - begin):
-        for c in range(first, seen.shape[1]):
-            n = min(max(int(np.rint(seen[i, c] * over)), -reach), reach)
-            out[i, c] += per_bit * over * tables[c - first, reach + n]
-
-
-@parallel_kernel()
-def _add_colour(
-    lane: int, lanes: int, seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32
-) -> None:
-    """Add the slopes of colours through the transform to luma and chroma; parallel over runs of rows.
-
-    Args:
-        seen: [n, K, 3], decoded red, green, blue.
-        step: quantisation step of the luma.
-        shift: the chroma's step is coarser by 2**shift.
-        tables: [3 K, 2 · MAX_INTEGER + 1], slopes of Y, Co, Cg in bits per step.
-        per_bit: loss per bit.
-        out: [n, K, 3], gradients of the loss; incremented.
-    """
-    reach = tables.shape[1] // 2
-    over = np.float32(1.0 / step)
-    chroma = np.float32(0.5**shift)
-    begin, end = lane_range(lane, lanes, seen.shape[0])
-    seen, out = seen[begin:end], out[begin:end]
-    for i in range(end - begin):
-        for k in range(seen.shape[1]):
-            red = int(np.rint(seen[i, k, 0] * over))
-            green = int(np.rint(seen[i, k, 1] * over))
-            blue = int(np.rint(seen[i, k, 2] * over))
-            co = red - blue
-            t = blue + (co >> 1)
-            cg = green - t
-            y = t + (cg >> 1)
-            by_y = tables[3 * k, reach + min(max(y, -reach), reach)]
-            by_co = chroma * tables[3 * k + 1, reach + min(max(co >> shift, -reach), reach)]
-            by_cg = chroma * tables[3 * k + 2, reach + min(max(cg >> shift, -reach), reach)]
-            # Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2, up to rounding.
-            quarter, half = np.float32(0.25), np.float32(0.5)
-            out[i, k, 0] += per_bit * over * (quarter * by_y + by_co - half * by_cg)
-            out[i, k, 1] += per_bit * over * (half * by_y + by_cg)
-            out[i, k, 2] += per_bit * over * (quarter * by_y - by_co - half * by_cg)

@@ -3,11 +3,8 @@
 import subprocess
 import sys
 
-import pytest
-
 
 def test_vectors_and_images_are_those_of_the_recipes():
-    pytest.importorskip("numba", reason="images need the extra [render]")
     words = [sys.executable, "-m", "csplat_authoring", "--check", "--renders"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (0, "") == (done.returncode, done.stdout + done.stderr)

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from functools import cache
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from encoder_faults.run import encode as encode_wrongly
 
 INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
-HAS_RENDERER = find_spec("numba") is not None
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +88,7 @@ def check_report(name, report):
 @pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_fault_is_caught_and_every_freedom_is_left(report_of, group):
-    names = [name for name in GROUPS[group] if HAS_RENDERER or FAULTS[name].caught[0] != "L4"]
-    assert [] == failures({name: name for name in names}, lambda name: check_report(name, report_of(name)))
+    assert [] == failures({name: name for name in GROUPS[group]}, lambda name: check_report(name, report_of(name)))
 
 
 @pytest.mark.slow

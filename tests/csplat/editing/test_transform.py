@@ -31,8 +31,7 @@ from csplat_tools.cli.shared_options import parse_up, up_word
 from csplat_tools.views import display_cameras, find_view_set
 from csplat_trainer.data.loader import estimate_up_of_cameras
 
-for name in ("numba", "scipy", "PIL"):
-    pytest.importorskip(name, reason="renders and training require the extra [render]")
+pytest.importorskip("PIL", reason="training requires the extra [render]")
 
 
 def test_up_survives_ply_and_csplat_files_unless_it_is_invalid(tmp_path, make_model):

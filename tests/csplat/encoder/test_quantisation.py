@@ -171,7 +171,6 @@ def test_blocks_of_shapes_agree_with_the_covariance(make_model):
 
 @pytest.mark.slow
 def test_the_error_of_rounding_is_predicted():
-    pytest.importorskip("numba", reason="pictures require the extra [render]")
     from captures import cameras, shell
 
     from csplat_render import render

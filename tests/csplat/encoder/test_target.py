@@ -16,8 +16,6 @@ from csplat.encoder import Target
 from csplat.errors import InputError
 from csplat_conformance.validator import validate
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-
 pytestmark = pytest.mark.usefixtures("small_views")
 
 

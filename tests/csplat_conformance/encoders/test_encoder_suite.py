@@ -7,7 +7,6 @@ import json
 import tempfile
 from functools import cache
 from importlib.resources import files
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +89,6 @@ def test_our_encoder_passes_at_other_presets(preset):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("numba") is None, reason="pictures require the extra [render]")
 @pytest.mark.parametrize(("preset", "decibels", "names"), [
     ("fast", 34, "ordinary/degree_3"),
     ("balanced", 34, "ordinary/degree_3,ordinary/needles_and_discs"),

@@ -115,7 +115,7 @@ def test_pictures_judge_at_any_level_where_errors_prove_nothing(altered, change,
     assert seen.passed
     assert [("L1", passed), ("L2", passed), ("L3", open_), ("L4", passed)] == statuses(seen)
     assert ("L4", Status.FAILED) == statuses(bad)[-1] == statuses(blind)[-1]
-    assert f"{why}: only renders can check it, and no numba" == blind.outcomes[-1].message
+    assert f"{why}: only renders can check it, and no renderer" == blind.outcomes[-1].message
 
 
 def test_pictures_are_requested_where_they_are_needed_at_the_level_of_errors(altered):

@@ -7,8 +7,6 @@ from posed_sets import cameras, write_colmap
 from csplat.errors import InputError
 from csplat_trainer.data.colmap import read_images, read_points
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 @pytest.mark.slow
 def test_every_prefix_of_colmap_files_and_names_with_control_characters_are_refused(tmp_path):

@@ -16,13 +16,11 @@ from PIL import Image
 from posed_sets import H, W, assert_refused, cameras, report_of
 
 from csplat.errors import InputError
+from csplat_render.kernels import call
 from csplat_trainer.data import load
 from csplat_trainer.data.colmap import read_cameras
 from csplat_trainer.data.lens import Lens, distorted
 from csplat_trainer.initial_splats import measure_extent, place_splats
-
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 LENS_W, LENS_H = 120, 90
 FOCAL = [100.0, 98.0, 62.0, 44.0]
@@ -160,6 +158,24 @@ def test_images_of_every_kind_of_lens_are_undistorted(tmp_path, model, parameter
     assert_is_straight(data.train[0])
     notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cropped" in line]
     assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(notes)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_pixels_are_interpolated_between_centres_and_colours_weighted_by_alpha(channels):
+    rng, found = np.random.default_rng(channels), np.zeros((200, channels), np.uint8)
+    pixels = rng.integers(0, 256, (5, 7, channels), np.uint8)
+    x, y = rng.uniform(-2.0, 9.0, 200), rng.uniform(-2.0, 7.0, 200)  # the image ends at 7 and 5
+    call("interpolate", pixels, *pixels.shape, x, y, 200, 1e-3, found)
+    values = pixels.astype(np.float64)
+    if channels == 4:
+        values[..., :3] *= values[..., 3:]
+    column, row = np.clip(x - 0.5, 0, 6), np.clip(y - 0.5, 0, 4)
+    weights = np.maximum(0.0, 1.0 - np.abs(np.arange(7) - column[:, None]))[:, None]
+    weights = weights * np.maximum(0.0, 1.0 - np.abs(np.arange(5) - row[:, None]))[..., None]
+    expected = np.einsum("nyx,yxc->nc", weights, values)
+    if channels == 4:
+        expected[:, :3] /= np.maximum(expected[:, 3:], 1e-3)
+    assert np.abs(expected - found).max() < 0.5 + 1e-9
 
 
 def test_factors_of_other_lens_models_are_refused(tmp_path):

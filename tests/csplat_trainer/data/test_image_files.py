@@ -17,9 +17,6 @@ from csplat.errors import InputError
 from csplat_trainer.data import load
 from csplat_trainer.data.image_files import match_names
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
-
 NFC, NFD = (unicodedata.normalize(form, "Köln.png") for form in ("NFC", "NFD"))
 
 

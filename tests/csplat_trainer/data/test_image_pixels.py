@@ -11,9 +11,6 @@ from posed_sets import H, W
 from csplat.errors import InputError
 from csplat_trainer.data.image_pixels import mask_values, open_image, read_image_header, rgb_pixels
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
-
 HALF_SEEN = np.where(RAMP < 0.5, 0, 200).astype(np.uint8)
 RGBA = np.dstack([RGB, HALF_SEEN])
 RGB_16 = RGB.astype(np.uint16) * 257

@@ -20,9 +20,6 @@ from csplat_render.camera import relative_to
 from csplat_trainer.data import load
 from csplat_trainer.initial_splats import measure_extent
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
-
 colmap_text = partial(sets.write_colmap_set, text=True)
 
 

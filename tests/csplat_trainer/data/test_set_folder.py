@@ -13,9 +13,6 @@ from csplat_tools.cli.app import app
 from csplat_trainer.data import load
 from csplat_trainer.data.set_folder import SetFolder
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
-
 COLUMNS = "property float x\nproperty float y\nproperty float z\n"
 PLY = f"ply\nformat ascii 1.0\nelement vertex 1\n{COLUMNS}end_header\n1 2 3\n"
 

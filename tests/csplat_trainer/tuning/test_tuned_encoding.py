@@ -12,8 +12,6 @@ import csplat
 import csplat_trainer
 from csplat import Context, decode
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 @pytest.mark.slow
 def test_finetune_takes_a_model_and_views_and_reports_every_step():

@@ -32,8 +32,6 @@ from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 from csplat_trainer.tuning.tuning_loop import RateController
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 def written(fixed, values):
     return fixed.encode(values).write().data
@@ -123,7 +121,7 @@ def test_lambda_is_controlled_to_meet_a_size():
     fixed = fixed_by(EncodeOptions(attribute_psnr=34.0))
     before = len(written(fixed, fixed.start()))
     options, costs = replace(QUICK, byte_cost=4e-3), []
-    for share, steps in ((0.93, 120), (1.5, 60)):
+    for share, steps in ((0.92, 120), (1.5, 60)):
         tuned = tune(fixed, views_of_source(), replace(options, iterations=steps), size_bytes=int(share * before))
         size = len(written(fixed, tuned.best_values))
         assert size <= share * before

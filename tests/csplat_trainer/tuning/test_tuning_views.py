@@ -14,8 +14,6 @@ from csplat_render import render
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.tuning import TuningView, TuningViews, renders_of, split_views, tune
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 @pytest.mark.slow
 def test_masked_pixels_do_not_influence_tuning():

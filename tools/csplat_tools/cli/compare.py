@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +15,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.text_reports import format_comparison
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import findings_of, load_scene, open_scenes, sample_scene
 from csplat_tools.views import Split
 
@@ -103,8 +102,7 @@ def compare(
             )
         compared = csplat_tools.compare(
             source, other, views=view_set, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
-            mode=mode, backend=device, force=out.force,
-            prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), context=context,
+            mode=mode, backend=device, force=out.force, context=context,
         )  # fmt: skip
     out.publish(compared.as_json(), format_comparison(compared, Path(a).name, Path(b).name))
     if pictures is not None:

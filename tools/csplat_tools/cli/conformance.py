@@ -6,7 +6,6 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +32,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
 from csplat_tools.console import note, print_data
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
 #: Clauses of the specification, as opposed to names of checks: `HDR-*`, `LIM-1`.
@@ -166,12 +165,11 @@ def encoder(
 
     L1: the status is as expected, the file breaks no clause, and a second run
     gives the same bytes. L2: every splat is there once, or counted as left
-    out. L3: the declared errors hold. L4: renders reach --min-psnr (requires
-    the render extra; also checked if L3 verifies nothing). Without --cmd,
-    csplat's own encoder is tested. Otherwise it starts in an empty folder, and
-    exits with status 0 and a file, or with 1 and a reason as the last line of
-    standard error or output. {index}: a .npy file, the source splat of each
-    splat.
+    out. L3: the declared errors hold. L4: renders reach --min-psnr (also
+    checked if L3 verifies nothing). Without --cmd, csplat's own encoder is
+    tested. Otherwise it starts in an empty folder, and exits with status 0 and
+    a file, or with 1 and a reason as the last line of standard error or output.
+    {index}: a .npy file, the source splat of each splat.
 
     Examples:
       csplat conformance encoder --cmd 'my-encoder {ply} {out}'
@@ -194,7 +192,7 @@ def encoder(
         return
     levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4", last=4))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
-    render_score, reason = _render_scorer(levels, quiet=out.quiet)
+    render_score, reason = _render_scorer(levels)
     least = PSNR_MIN if min_psnr is None else min_psnr
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or ENCODER_SECONDS
     options = EncoderSuiteOptions(_join_patterns(filters), levels, seconds, least, jobs, kept)
@@ -261,27 +259,17 @@ def _checked_folder(name: str, *, force: bool) -> Path:
     return folder
 
 
-def _render_scorer(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore | None, str]:
-    """Return a function that measures the PSNR of renders, or `None` and the reason.
-
-    Args:
-        levels: levels to be checked. At L4 every file is rendered, and the renderer is prepared at once. At L3 alone
-            hardly any file is, and the renderer is prepared at the first.
-        quiet: print nothing while the renderer is compiled.
-    """
+def _render_scorer(levels: Sequence[str]) -> tuple[RenderScore | None, str]:
+    """Return a function that measures the PSNR of renders, or `None` and the reason; `levels` are to be checked."""
     if not {"L3", "L4"} & {*levels}:
         return None, ""
     try:
         require_renderer()
     except InputError as error:
         return None, str(error)
-    ready = cache(lambda: prepare_renderer(quiet=quiet))
-    if "L4" in levels:
-        ready()
 
     def psnr(source: SplatModel, decoded: SplatModel) -> float:
-        """Return the PSNR of renders of two scenes, dB; prepares the renderer at the first call."""
-        ready()
+        """Return the PSNR of renders of two scenes, dB."""
         from csplat_render.scorer import Scorer
         from csplat_tools.views import comparison_cameras
 

@@ -28,7 +28,7 @@ from csplat_tools.encode_file import (
 )
 from csplat_tools.file_streams import check_name, source_path
 from csplat_tools.level_builder import LevelCount, choose_levels
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import read_source
 from csplat_tools.views import ViewSet
 
@@ -92,10 +92,10 @@ def encode(
     The file declares its largest errors. --preset: fast for previews, balanced
     for archives, small if size matters more than precision. One of
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
-    chooses the precision and prunes splats, and requires the render extra; it
-    goes on as long as it expects to save 1 % of the bytes per 10 CPU seconds.
-    --max-error limits errors of means, covariance, opacities, sh0 to sh4. Views
-    are virtual without --data or --cameras. --levels adds coarser versions of
+    chooses the precision and prunes splats; it goes on as long as it expects to
+    save 1 % of the bytes per 10 CPU seconds. --max-error limits errors of means,
+    covariance, opacities, sh0 to sh4. Views are virtual without --data, which
+    requires the render extra, or --cameras. --levels adds coarser versions of
     the scene, which viewers show first: 35 % more bytes, and minutes. --help-all
     shows --keep, --cameras, --up and all other options.
 
@@ -208,8 +208,7 @@ def _find_views(
     out: Output,
     context: Context,
 ) -> ViewSet:
-    """Compile the renderer, find the views of a scene, and announce how long the search will take."""
-    prepare_renderer(quiet=out.quiet, simplify=True)
+    """Find the views of a scene, and announce how long the search will take."""
     from csplat_tools.optimise.target_encoding import expected_search_seconds
 
     view_set = views.find(model, out)

@@ -14,7 +14,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import is_csplat, local_path, mapped_csplat
 from csplat_tools.inspect.file_description import describe_file, describe_other_format
 from csplat_tools.inspect.text_reports import format_description
-from csplat_tools.optional_packages import prepare_renderer, require_images
+from csplat_tools.optional_packages import require_images, require_renderer
 
 
 def info(
@@ -45,7 +45,7 @@ def info(
     out.check(inputs=(source, original), named={"--page": page})
     with ExitStack() as stack, out.bar() as progress:
         if original is not None:
-            prepare_renderer(quiet=out.quiet, ssim=True)
+            require_renderer()
             require_images()
         local = stack.enter_context(local_path(source))
         if not is_csplat(local):

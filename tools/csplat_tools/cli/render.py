@@ -15,7 +15,7 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import note
 from csplat_tools.file_streams import STANDARD_STREAM, check_name
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
 from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.scene_files import load_scene, splats_to_frame
@@ -98,7 +98,7 @@ def render(
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,
-            prepare=partial(prepare_renderer, quiet=out.quiet), context=Context(progress=progress),
+            context=Context(progress=progress),
         )  # fmt: skip
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")

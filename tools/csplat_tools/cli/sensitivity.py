@@ -11,7 +11,7 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name
 from csplat_tools.inspect.text_reports import format_sensitivity
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import load_scene
 
 #: Cost of the measurement, in renders of all views.
@@ -33,7 +33,8 @@ def sensitivity(
 
     `csplat encode --importance` reads the file, which is valid for this scene
     only. The images of the training give the best result; without them,
-    virtual views are added until they agree. Requires the render extra.
+    virtual views are added until they agree. --data requires the render
+    extra.
 
     Examples:
       csplat sensitivity scene.ply scene.npz --data capture
@@ -51,8 +52,6 @@ def sensitivity(
         read = load_scene(source)
         out.print_findings(read.findings)
         model = read.model()
-        are_virtual = data is None and cameras is None
-        prepare_renderer(quiet=out.quiet, simplify=are_virtual)
         view_set = views.find(
             model, out, count=None if cameras is None else 0, validation_count=None if data is None else 0
         )

@@ -11,7 +11,7 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name, write_model
 from csplat_tools.inspect.text_reports import format_simplification
-from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import load_scene
 
 #: Cost in renders of all training views: for --keep, and for a target, which searches for the fraction to keep. Half of
@@ -40,7 +40,7 @@ def simplify(
     Splats are fitted to training views, validation views decide how many are
     kept, and test views score the result. --max-psnr-drop requires --data.
     `csplat encode` with a target does the same for the file that it writes.
-    Requires the render extra.
+    --data requires the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -67,7 +67,6 @@ def simplify(
         read = load_scene(source)
         out.print_findings(read.findings)
         model = overrides.apply_to_model(read.model())
-        prepare_renderer(quiet=out.quiet, simplify=True)
         view_set = views.find(model, out)
         passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
         size = options.views_and_size(len(model))[1]

@@ -11,7 +11,7 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import note
 from csplat_tools.file_streams import write_bytes
-from csplat_tools.optional_packages import prepare_renderer, require_plots
+from csplat_tools.optional_packages import require_plots, require_renderer
 
 
 def tradeoff(
@@ -38,7 +38,7 @@ def tradeoff(
       simplify=0.7:0.5    fractions of the splats; slow
     A group without `=` has default values. PSNR is measured against the
     source's renders, as by `csplat compare`, and against the images of --data.
-    Requires the render extra.
+    -o and --data require the render extra.
 
     Examples:
       csplat tradeoff scene.ply
@@ -55,12 +55,12 @@ def tradeoff(
     grid = shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
     searches = [(setting.options, setting.target) for setting in grid if setting.target is not None]
     out.check(inputs=(source, *views.inputs), named={"-o": page})
+    require_renderer()
     if page is not None:
         require_plots()
     with out.bar() as progress:
         read, context = read_source(source), Context(progress=progress)
         out.print_findings(read.findings)
-        prepare_renderer(quiet=out.quiet, simplify=bool(searches), ssim=True)
         view_set = views.find(read.model(), out)
         if len(read.model()):
             out.announce_time(

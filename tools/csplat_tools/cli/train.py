@@ -17,6 +17,7 @@ from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
 _BACKGROUNDS = ", ".join(BACKGROUNDS)
+_ENGINE_HELP = "native, or torch: slower on a CPU. Default: native, with cuda torch."
 
 
 def train(
@@ -40,6 +41,9 @@ def train(
     device: Annotated[
         str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
     ] = "cpu",
+    engine: Annotated[
+        str, typer.Option(metavar="ENGINE", hidden=True, show_default=False, help=_ENGINE_HELP)
+    ] = _DEFAULT.engine,
     page: shared.Page = None,
     up: shared.HiddenUp = None,
     size: Annotated[
@@ -101,7 +105,7 @@ def train(
 
     options = shared.checked(
         TrainOptions, max_splats=TrainOptions.max_splats if max_splats is None else max_splats, sh_degree=sh_degree,
-        iterations=iterations, seed=seed, device=device, background=background, antialiased=antialiased,
+        iterations=iterations, seed=seed, device=device, engine=engine, background=background, antialiased=antialiased,
     )  # fmt: skip
     if to_file:
         options = plan_training(options, target, max_splats=max_splats, resume=resume)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -150,10 +150,9 @@ def compare(
     mode: Mode = "standard",
     backend: Backend = "cpu",
     force: bool = False,
-    prepare: Callable[[], object] | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> Comparison:
-    """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
+    """Compare a scene with its source, as `csplat compare` does.
 
     Args:
         a, b: the source, and the scene compared with it: models, open scenes, or files in any
@@ -169,7 +168,6 @@ def compare(
         backend: what renders, as in `csplat_render.render`. A GPU computes PSNR alone, unless images are needed for
             something else: `pictures`, `lpips`, or the images of a data set. Both scenes have to fit in memory.
         force: existing files in `pictures` may be replaced.
-        prepare: called when all inputs have been checked, before the first render.
         context: threads, progress, and memory, without images of a data set; scenes that do not fit together are
             compared out of core.
 
@@ -202,8 +200,6 @@ def compare(
         first: SplatModel | Renderable
         second: SplatModel | Renderable
         first, second, errors = _prepare_scenes(source, other, views.test, bound, source_index, context)
-        if prepare is not None:
-            prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
         viewers += [] if image_scores is None else [image_scores]
         device, _ = find_device(backend)

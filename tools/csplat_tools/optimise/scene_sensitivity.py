@@ -127,10 +127,6 @@ def measure_views(
     """
     if not len(model):
         raise InputError(_NOTHING)
-    if context.progress is not null_progress:  # compiling takes some seconds unless cached
-        context.progress("compiling", 0.0)
-        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
-        context.progress("compiling", 1.0)
     sensitivity = measure_sensitivity(
         model, cameras, background=background, metric=matrices, magnitudes=magnitudes, context=context
     )

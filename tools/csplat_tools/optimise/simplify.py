@@ -109,8 +109,6 @@ def simplify(
 ) -> Simplified:
     """Prune splats to a target, and refit the others, as `csplat simplify` does.
 
-    Requires the packages of the render extra.
-
     Args:
         scene: a model, or a file in any format.
         target: a fraction to keep, a PSNR, or a drop of PSNR; the fewest splats that meet it are kept.

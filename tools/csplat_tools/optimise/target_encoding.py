@@ -45,7 +45,7 @@ def meet_target(
         The file. Its source index refers to the source, and its report contains the search's report.
 
     Raises:
-        InputError: the extra `render` is missing, there are no splats, an option is set that the target determines, or
+        InputError: the renderer is not installed, there are no splats, an option is set that the target determines, or
             the target is out of reach.
     """
     start = time.perf_counter()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,7 +95,6 @@ def render_folder(
     depth: bool = False,
     alpha: bool = False,
     force: bool = False,
-    prepare: Callable[[], object] | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> Rendered:
     """Render a scene and write NAME.png for each camera.
@@ -110,7 +109,6 @@ def render_folder(
             without splats. Requires the backend cpu.
         alpha: write NAME.alpha.png, too; 255 is opaque.
         force: existing files may be replaced.
-        prepare: called when the folder has been checked, before the first render.
         context: threads and progress.
 
     Raises:
@@ -127,7 +125,7 @@ def render_folder(
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _remove_if_empty(target if is_new else None):
-        renders = _render_each(model, cameras, background, mode, backend, prepare, context)
+        renders = _render_each(model, cameras, background, mode, backend, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
@@ -152,7 +150,6 @@ def render_film(
     mode: Mode = "standard",
     backend: Backend = "cpu",
     force: bool = False,
-    prepare: Callable[[], object] | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> Rendered:
     """Render a scene into one animated file.
@@ -162,7 +159,7 @@ def render_film(
         cameras: the views, at least one, of one size.
         path: path of the file; its ending determines the format, see `write_film`.
         fps: frames per second.
-        background, mode, backend, prepare, context: see `render_folder`.
+        background, mode, backend, context: see `render_folder`.
         force: an existing file may be replaced.
 
     Raises:
@@ -173,7 +170,7 @@ def render_film(
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
-    for result in _render_each(model, cameras, background, mode, backend, prepare, context):
+    for result in _render_each(model, cameras, background, mode, backend, context):
         ignored = max(ignored, result.ignored)
         frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
@@ -201,12 +198,9 @@ def _render_each(
     background: Colour | None,
     mode: Mode,
     backend: Backend,
-    prepare: Callable[[], object] | None,
     context: Context,
 ) -> Iterator[Render]:
-    """Yield the render of each camera, with arguments as for `render_folder`. Calls `prepare` and reports progress."""
-    if prepare is not None:
-        prepare()
+    """Yield the render of each camera, with arguments as for `render_folder`, and report progress."""
     record = model.metadata.training
     colour = background or (record.background if record else BLACK)
     draw = renderer(on_backend(model, backend), colour, mode=mode, context=context)

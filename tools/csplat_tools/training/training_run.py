@@ -15,15 +15,15 @@ from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.console import note, step_progress
 from csplat_tools.file_streams import write_model
-from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.training.tuning_report import describe_step, show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, paced, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
+from csplat_trainer.device_measurements import make_rasteriser
 from csplat_trainer.fit_checkpoint import load_checkpoint
 from csplat_trainer.losses import PerceptualLoss
-from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
+from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult, uses_torch
 from csplat_trainer.training_report import plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
@@ -178,7 +178,8 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
     usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
     steps = max(usual.iterations, round(_TUNING * training.iterations))
-    return paced(replace(tuning, iterations=steps, lr_exposure=training.lr_exposure, device=training.device))
+    engine, device = training.engine, training.device
+    return paced(replace(tuning, iterations=steps, lr_exposure=training.lr_exposure, device=device, engine=engine))
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
@@ -211,12 +212,9 @@ def _train(
     """
     for line in () if quiet else data_set.report:
         note(line)
-    data_set.read()  # before kernels are compiled, to find damaged images early
-    with thread_count(context.threads):
-        if options.device == "cpu":
-            prepare_renderer(quiet=quiet, gradients=True)
-        with step_progress("training", describe_step, quiet=quiet) as show:
-            result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
+    data_set.read()  # to find damaged images before the first step
+    with thread_count(context.threads), step_progress("training", describe_step, quiet=quiet) as show:
+        result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data_set.name).name)
     if not quiet:
@@ -234,11 +232,13 @@ def _load(data: DataOptions, options: TrainOptions, files: Outputs) -> DataSet:
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:
-    """Check small inputs before the data set is read and kernels are compiled, which takes long.
+    """Check small inputs before the data set is read, which takes long.
 
     Raises:
-        InputError: weights, checkpoint or torch are missing or damaged, or the path of previews is not a folder.
+        InputError: weights, checkpoint, torch or GPU are missing or damaged, or the path of previews is not a folder.
     """
+    if uses_torch(options.device, options.engine):
+        make_rasteriser(options.device, antialiased=options.antialiased)
     if options.lpips_weight > 0.0:
         PerceptualLoss(load_lpips(files.lpips_weights))
     elif files.lpips_weights is not None:

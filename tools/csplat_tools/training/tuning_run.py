@@ -32,7 +32,6 @@ from csplat_tools.optimise.pruning import PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_search import Goal, TargetSearch, check_target
-from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.training.tuning_report import (
     describe_step,
     make_tuning_report,
@@ -156,7 +155,6 @@ def run_finetuning(
         OSError: a file cannot be read or written.
     """
     with thread_count(context.threads):
-        prepare_renderer(quiet=quiet, gradients=True)
         with step_progress("tuning", describe_step, quiet=quiet) as show:
             tuned = choose_and_finetune(
                 source, views, encoding, options, target, files=files, prune_unseen=prune_unseen, importance=importance,

@@ -25,6 +25,7 @@ from csplat.types import F32, F64
 from csplat_conformance.declared_bounds import Source
 from csplat_render import Camera, Mode
 from csplat_render.conventions import HasSplats, RenderResult
+from csplat_render.rasteriser import Rasteriser
 from csplat_tools.views.splat_spool import open_spool, record_type
 
 STAGE = "drawing one picture by way of the disk"
@@ -110,10 +111,8 @@ class _SlicedRender:
     """A render in progress. Owns the state of its pixels."""
 
     def __init__(self, scene: SlicedScene, camera: Camera, background: ArrayLike, mode: Mode, context: Context) -> None:
-        from csplat_render.rasteriser import Rasteriser  # numba takes a second to import
-
         self._scene, self._camera, self._background, self._progress = scene, camera, background, context.progress
-        self._rasteriser = Rasteriser(mode, gradients=False, context=context)
+        self._rasteriser = Rasteriser(mode, context=context)
         self._state = self._rasteriser.initial_state(camera)
         self._record, self._splat_bytes = scene.record, scene.splat_bytes
         self._ignored, self._visible, self._done, self._pairs = 0, 0, 0, 0

@@ -63,7 +63,7 @@ def crowd(model: SplatModel, cameras: Sequence[Camera], count: int, seed: int = 
         seed: seed of all random choices.
     """
     rng = np.random.default_rng(seed)
-    rasteriser = Rasteriser(gradients=False)
+    rasteriser = Rasteriser()
     seen = np.median([rasteriser.forward(model, camera).drawn for camera in cameras])
     model = split(model, math.ceil(1.1 * count / seen), rng)
     views = np.array([rasteriser.forward(model, camera).radii > 0 for camera in cameras])

@@ -63,7 +63,7 @@ def timed(call: Callable[P, T], /, *args: P.args, **named: P.kwargs) -> tuple[T,
 
 
 def alone(call: Callable[P, T], /, *args: P.args, **named: P.kwargs) -> T:
-    """Call a module's function in a new process, where nothing is compiled and no memory is in use yet."""
+    """Call a module's function in a new process, where no memory is in use yet."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(call, *args, **named).result()
 

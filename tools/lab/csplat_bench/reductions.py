@@ -1,14 +1,8 @@
-"""Simple ways to reduce a scene, for comparison: prune by opacity, truncate or distil SH, cluster attributes.
-
-To distil SH is to refit the colours of fewer bands to renders of the source. With fixed geometry a render is linear in
-the coefficients, so the fit is a ridge least-squares problem, solved by conjugate gradients. Few views overfit: 300
-splats with extreme SH lost 0.7 dB on other views if degree 0 was fitted to 28 views, and gained 2.3 dB with 112.
-"""
+"""Simple ways to reduce a scene, for comparison: prune by opacity, truncate SH, cluster attributes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,16 +17,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.scene import drop_bands
 from csplat.types import F32, F64, I64, Progress
-from csplat_render import Camera
-from csplat_render.scorer import Scorer, renderer
-from csplat_tools.views import ViewSet, find_view_set, shrink_cameras
 
 #: Attributes that are clustered, in the order of a model's fields.
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-_VIEWS = 160  # virtual views for distilling, without given views
-_HOLD_OUT_EVERY = 8  # every Nth of them is a validation view
-_FIT_STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views
 _MAX_ENTRIES = 1 << 16  # largest number of entries of a codebook
 _NORM = 2000.0  # norm of the longest vector in lattice units: below 2,300 the search is exact everywhere
 _GROUPED = 2048  # number of entries from which only the nearest groups of them are searched
@@ -46,7 +34,6 @@ class Reduction:
     Attributes:
         prune_opacity: prune splats of at most this alpha; `None`: keep all.
         sh_degree: drop the SH bands above; `None`: keep all.
-        distil: fit the remaining bands to renders of the source; otherwise they are unchanged.
         kmeans: entries of a codebook for each attribute; `None`: no clustering.
 
     Raises:
@@ -55,7 +42,6 @@ class Reduction:
 
     prune_opacity: float | None = None
     sh_degree: int | None = None
-    distil: bool = False
     kmeans: int | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +58,6 @@ def encode_reduced(
     reduction: Reduction,
     encoding: EncodeOptions | None = None,
     *,
-    views: ViewSet | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> EncodeResult:
     """Prune, drop SH bands, cluster, and encode.
@@ -81,51 +66,33 @@ def encode_reduced(
         source: the scene.
         reduction: the steps. If its `sh_degree` is `None`, that of `encoding` is used.
         encoding: options of the encoder.
-        views: training and validation views for distilling; `None` for virtual ones.
         context: threads, seed and progress.
 
     Returns:
-        The file and its source index. The file declares error bounds against the source, except for distilled
-        colours; for these its metadata contain the PSNR on the validation views.
+        The file and its source index. The file declares error bounds against the source.
 
     Raises:
-        InputError: all splats would be pruned; there are no bands to distil, or too few views; or as for the encoder.
+        InputError: all splats would be pruned, or as for the encoder.
     """
     encoding = encoding or EncodeOptions()
     if reduction.sh_degree is not None:
         encoding = replace(encoding, sh_degree=reduction.sh_degree)
     degree = encoding.kept_degree(source.sh_degree)
     encoding = replace(encoding, sh_degree=degree)
-    renders = None
-    if reduction.distil:
-        if degree >= source.sh_degree:
-            raise InputError(f"the scene has SH of degree {source.sh_degree}: distilling requires a lower sh_degree")
-        if views is None:
-            held_out = _VIEWS // _HOLD_OUT_EVERY
-            views = find_view_set(source, count=_VIEWS - held_out, validation_count=held_out)
-        renders = SourceRenders.of_source(source, views, context=context)
     model, rows = source, np.arange(len(source), dtype=np.int64)
     report: dict[str, Any] = {"splats": len(source)}
     if reduction.prune_opacity is not None:
         model, rows = prune_opacity(source, reduction.prune_opacity)
         report["prune_opacity"] = reduction.prune_opacity
     if degree < source.sh_degree:
-        report |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
+        report |= {"sh_degree": degree, "sh": "truncated"}
     if reduction.kmeans is not None:
-        model = drop_bands(model, degree) if renders is None else renders.distilled(model, degree)
-        model, report["kmeans"] = cluster_attributes(model, reduction.kmeans, context=context)
+        model, report["kmeans"] = cluster_attributes(drop_bands(model, degree), reduction.kmeans, context=context)
         model = _with_bands(model, source.sh_degree)
-    origin = Origin(len(source), rows, refitted=renders is not None)
-    plan = EncodePlan.of(model, encoding, origin=origin, context=context)
-    if renders is not None and reduction.kmeans is None:
-        distilled = _with_bands(renders.distilled(plan.scene, degree), source.sh_degree)
-        plan = plan.with_colours(distilled.sh0, distilled.shN)
+    plan = EncodePlan.of(model, encoding, origin=Origin(len(source), rows), context=context)
     tiles = encode_tiles(plan)
-    if renders is not None or reduction.kmeans is not None:
-        decoded = decode(tiles.write().data, context=context)
-        tiles = tiles if reduction.kmeans is None else tiles.against(source, decoded)
-        if renders is not None:
-            report |= {"views": len(renders.cameras), "check_psnr": round(renders.check_scorer.psnr(decoded), 3)}
+    if reduction.kmeans is not None:
+        tiles = tiles.against(source, decode(tiles.write().data, context=context))
     return tiles.write({"reduced": report})
 
 
@@ -160,51 +127,6 @@ def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:
 def _check_threshold(tau: float) -> None:
     if not 0.0 <= tau < 1.0:
         raise InputError(f"the opacity to prune by is {tau:g}, expected at least 0 and less than 1")
-
-
-@dataclass(frozen=True, eq=False)
-class SourceRenders:
-    """Renders of a source, to which the colours of other scenes are fitted.
-
-    Attributes:
-        cameras: the training views.
-        references: [H, W, 3], the source's render of each.
-        check_scorer: scorer on the validation views.
-        background: background colour.
-        context: threads and progress.
-    """
-
-    cameras: Sequence[Camera]
-    references: Sequence[F32]
-    check_scorer: Scorer
-    background: tuple[float, float, float]
-    context: Context
-
-    @classmethod
-    def of_source(cls, source: SplatModel, views: ViewSet, *, context: Context = DEFAULT_CONTEXT) -> SourceRenders:
-        """Render the source in the training and validation views, reduced to a small size.
-
-        Raises:
-            InputError: there are no training or no validation views.
-        """
-        if not views.training:
-            raise InputError("there are no training views to fit colours to")
-        training, validation = shrink_cameras(views.training), shrink_cameras(views.validation)
-        draw = renderer(source, views.background, context=context)
-        references = [draw(camera).rgb for camera in training]
-        check_scorer = Scorer.of_source(source, validation, views.background, context=context)
-        return cls(training, references, check_scorer, views.background, context)
-
-    def distilled(self, model: SplatModel, sh_degree: int) -> SplatModel:
-        """Return the geometry of a model with SH up to a degree, fitted to the source's renders."""
-        from csplat_bench.colour_refit import fit_colours  # requires numba, unlike the other steps
-
-        low = drop_bands(model, sh_degree)
-        found, _ = fit_colours(
-            low, self.cameras, self.references, steps=_FIT_STEPS, least_gain=0.01, background=self.background,
-            antialiased=low.metadata.antialiased, context=self.context,
-        )  # fmt: skip
-        return replace(low, sh0=np.ascontiguousarray(found[:, 0]), shN=np.ascontiguousarray(found[:, 1:]))
 
 
 def cluster_attributes(

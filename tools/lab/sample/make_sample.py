@@ -20,7 +20,9 @@ import math
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +33,7 @@ from PIL import Image
 from csplat import SplatModel, write_ply
 from csplat.types import F32, F64
 from csplat_render.camera import Camera, intrinsics, look_at
-from csplat_render.warmup import warm_up
+from csplat_render.kernels import available_threads
 from csplat_trainer.data import load
 from csplat_trainer.fitter import FitStep
 from csplat_trainer.training_loop import train
@@ -92,7 +94,6 @@ def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> Tra
     """
     recipe = recipe or Recipe()
     points, colours = photograph_all(folder, recipe)
-    warm_up(_say)
     data = replace(load(folder), points=points, points_rgb=colours)
     result = train(data, recipe.training, on_step=_show)
     result = replace(result, model=finish(result.model))
@@ -123,19 +124,19 @@ def photograph_all(folder: Path, recipe: Recipe) -> tuple[F32, F32]:
     rng = np.random.Generator(np.random.PCG64(_SEED))
     for split, count in (("train", recipe.train_views), ("test", recipe.test_views)):
         (folder / split).mkdir(exist_ok=True)
-        frames = []
-        for number, camera in enumerate(cameras(count, recipe.size, between=split == "test")):
-            name = f"{split}/{number:03d}"
-            pixels, places = photograph(garden, camera)
-            Image.fromarray(pixels).save(folder / f"{name}.png")
-            frames.append({"file_path": f"./{name}", "transform_matrix": camera_to_world(camera).tolist()})
-            if split == "train":
-                solid = np.flatnonzero(pixels[..., 3] == 255)
-                chosen = rng.choice(solid, min(len(solid), recipe.points // count), replace=False)
-                points.append(places.reshape(-1, 3)[chosen])
-                colours.append(pixels.reshape(-1, 4)[chosen, :3] / 255.0)
-            if number % 10 == 9 or number + 1 == count:
-                _say(f"{number + 1} of {count} {split} pictures")
+        frames, views = [], cameras(count, recipe.size, between=split == "test")
+        with ThreadPoolExecutor(available_threads()) as pool:
+            for number, (pixels, places) in enumerate(pool.map(partial(photograph, garden), views)):
+                name = f"{split}/{number:03d}"
+                Image.fromarray(pixels).save(folder / f"{name}.png")
+                frames.append({"file_path": f"./{name}", "transform_matrix": camera_to_world(views[number]).tolist()})
+                if split == "train":
+                    solid = np.flatnonzero(pixels[..., 3] == 255)
+                    chosen = rng.choice(solid, min(len(solid), recipe.points // count), replace=False)
+                    points.append(places.reshape(-1, 3)[chosen])
+                    colours.append(pixels.reshape(-1, 4)[chosen, :3] / 255.0)
+                if number % 10 == 9 or number + 1 == count:
+                    _say(f"{number + 1} of {count} {split} pictures")
         document = {"camera_angle_x": math.radians(_FIELD_OF_VIEW), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(document, indent=1))
     return np.concatenate(points).astype(np.float32), np.concatenate(colours).astype(np.float32)

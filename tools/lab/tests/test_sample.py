@@ -17,7 +17,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "sample"
 UP = (0.0, -1.0, 0.0)  # y points down
 TURN = np.array([1.0, -1.0, -1.0])  # from the world to the garden, whose y points up
 SOLID = 255
-RECIPE = pytest.mark.slow  # compiling the garden takes ten seconds
+RECIPE = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,9 @@ def small(recipe):
     return recipe.Recipe(train_views=3, test_views=2, size=32, points=150, training=options)
 
 
-def field_at(garden, point):
-    """Return distance, part and item at a point of the garden."""
-    return sys.modules["distances"].field(garden, *point)
+def field_at(garden, points):
+    """Return distances, parts and items at points [P, 3] of the garden."""
+    return sys.modules["distances"].field(garden, np.reshape(points, (-1, 3)).T)
 
 
 @RECIPE
@@ -67,7 +67,7 @@ def test_pictures_are_read_with_their_cameras_and_start_points_lie_on_the_garden
     points, colours = recipe.photograph_all(tmp_path, small)
     assert (150, 3) == points.shape == colours.shape
     assert 0.0 <= colours.min() < colours.max() <= 1.0
-    assert max(abs(field_at(garden, point)[0]) for point in points * TURN) < 1e-3
+    assert np.abs(field_at(garden, points * TURN).distance).max() < 1e-3
     data = load(tmp_path)
     for pictures, count, between in ((data.train, 3, False), (data.test, 2, True)):
         for picture, wanted in zip(pictures, recipe.cameras(count, 32, between=between), strict=True):
@@ -87,7 +87,7 @@ def test_rays_end_at_the_first_surface(recipe, garden):
     for end in ends:
         reach = np.linalg.norm(end - eye)
         places = eye + np.arange(1.5, reach - 0.01, 0.002)[:, None] * (end - eye) / reach
-        missed += min(field_at(garden, place)[0] for place in places) < 0.0
+        missed += field_at(garden, places).distance.min() < 0.0
     assert missed <= 0.02 * len(ends)
     away = look_at((0.0, -0.1, -4.0), (0.0, -0.1, -8.0), UP, intrinsics(16, 16, 42.0), 16, 16)
     assert not recipe.photograph(garden, away)[0][..., 3].any()
@@ -97,17 +97,19 @@ def test_rays_end_at_the_first_surface(recipe, garden):
 def test_gloss_depends_on_the_direction_and_moss_does_not(garden):
     shade, kinds = sys.modules["photograph"]._shade, sys.modules["garden"]
     lamp = np.array([0.46, 0.76, 0.46])
-    directions = [-lamp - side * np.array([0.7, 0.0, -0.7]) for side in (-0.8, -0.4, 0.0, 0.4, 0.8)]
+    directions = np.array([-lamp - side * np.array([0.7, 0.0, -0.7]) for side in (-0.8, -0.4, 0.0, 0.4, 0.8)]).T
+    directions /= np.linalg.norm(directions, axis=0)
 
     def colours(point, wanted):
-        assert wanted == field_at(garden, point)[1]
-        return np.array([shade(garden, *point, *(d / np.linalg.norm(d))) for d in directions])
+        assert [wanted] == field_at(garden, point).part
+        return shade(garden, np.repeat(point[:, None], 5, axis=1), directions).T
 
     ball = garden.pebbles[garden.pebbles[:, 7] == 2][0]
     assert np.ptp(colours(ball[:3] + ball[3] * lamp, kinds.BALL), axis=0).min() > 0.3
     x, z = 0.0, -0.5
-    heights = [y for y in np.arange(0.5, -0.2, -1e-3) if field_at(garden, (x, y, z))[0] < 0.0]
-    assert np.ptp(colours((x, heights[0], z), kinds.MOSS), axis=0).max() == 0.0
+    column = np.stack([np.full(700, x), np.linspace(0.5, -0.2, 700), np.full(700, z)], axis=1)
+    inside = column[field_at(garden, column).distance < 0.0]
+    assert np.ptp(colours(inside[0], kinds.MOSS), axis=0).max() == 0.0
 
 
 def test_the_sample_has_no_defects_and_all_kinds_of_splats(sample_path):

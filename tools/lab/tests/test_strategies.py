@@ -1,13 +1,10 @@
 """Simple strategies: kept splats, sizes by hand, and verified files."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from checked import measure_errors
 
-from csplat import Context, EncodeOptions, decode
+from csplat import Context, EncodeOptions
 from csplat.decoder import decode_scene
 from csplat.encoder.error_bounds import covariance_errors
 from csplat.errors import InputError
@@ -19,24 +16,6 @@ from csplat_conformance.declared_bounds import Source, verify_bounds
 @pytest.fixture
 def source(make_model):
     return make_model(150, 2)
-
-
-@pytest.fixture(scope="module")
-def shell():
-    """A shell of overlapping splats."""
-    pytest.importorskip("numba", reason="rendering requires the extra [render]")
-    pytest.importorskip("PIL", reason="photographs require the extra [render]")
-    from captures import shell
-
-    return shell(8)
-
-
-@pytest.fixture
-def views_of():
-    """Return a function for training and validation views of the shell: `views_of(count)`."""
-    from captures import cameras, views_of
-
-    return lambda count: views_of(cameras(count))
 
 
 def stored(source, result):
@@ -145,43 +124,9 @@ def test_a_clustered_file_declares_its_errors_against_the_source(source):
     assert [24] == report["sh0"]["sizes"]
 
 
-@pytest.mark.slow
-def test_distilling_raises_the_psnr(shell, views_of):
-    from csplat_render.scorer import Scorer
-
-    truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(attribute_psnr=60.0))
-    reduction = Reduction(sh_degree=0, distil=True)
-    views = views_of(24)
-    distilled = encode_reduced(shell, reduction, EncodeOptions(attribute_psnr=60.0), views=views)
-    scene = stored(shell, distilled)
-    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
-    assert scene.declared_bounds.refitted
-    said = scene.options["reduced"]
-    assert ("distilled", 21) == (said["sh"], said["views"])
-    judge = Scorer.of_source(shell, views.validation, (0.0, 0.0, 0.0))
-    before, after = (judge.psnr(decode(one.data)) for one in (truncated, distilled))
-    assert said["check_psnr"] == pytest.approx(after, abs=0.5)
-    assert after > before + 1.0
-
-
-@pytest.mark.slow
-def test_distilled_and_clustered_colours_declare_no_error(shell, views_of):
-    reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=64)
-    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(9)))
-    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
-    assert {"kmeans", "check_psnr", "views", "prune_opacity"} <= set(scene.options["reduced"])
-    assert 8 == scene.options["reduced"]["views"]
-    assert 64 >= len(np.unique(np.round(scene.model.opacities, 5)))
-    one = shell.select(slice(0, 1))
-    assert 1 == len(stored(one, encode_reduced(one, Reduction(sh_degree=0, distil=True), views=views_of(9))).model)
-    with pytest.raises(InputError, match="requires at least one camera"):
-        encode_reduced(shell, Reduction(sh_degree=1, distil=True), views=views_of(1))
-
-
 def test_impossible_reductions_are_refused(make_model):
     model = make_model(20, 1)
     for call, message in (
-        (lambda: encode_reduced(model, Reduction(distil=True)), "SH of degree 1: distilling requires a lower"),
         (lambda: encode_reduced(model, Reduction(prune_opacity=0.9999)), "no splat has an opacity above"),
         (lambda: Reduction(prune_opacity=1.5), "the opacity to prune by is 1.5"),
         (lambda: Reduction(sh_degree=5), "sh_degree is 5"),
@@ -189,10 +134,3 @@ def test_impossible_reductions_are_refused(make_model):
     ):
         with pytest.raises(InputError, match=message):
             call()
-
-
-@pytest.mark.slow
-def test_pruning_and_clustering_need_no_renderer():
-    code = "import sys, csplat_bench.reductions; print(*{'numba', 'torch', 'matplotlib'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert "\n" == done.stdout

@@ -243,7 +243,7 @@ def _tiles_of(
             continue
         is_antialiased = isinstance(scene, SplatModel) and scene.metadata.antialiased
         own = is_antialiased if antialiased is None else antialiased
-        splats = checked_splats(scene, np.float32)
+        splats = checked_splats(scene)
         degree = checked_degree(sh_degree, splats.shN.shape[1])
         for start in range(0, len(splats.means), MODEL_TILE):
             part = slice(start, start + MODEL_TILE)
@@ -300,7 +300,7 @@ class GpuRenderer:
             LimitError: more splats than the buffers hold have the same depth, or the image is too wide for them.
             InputError: the background is invalid, or the GPU has not enough memory.
         """
-        colour = checked_background(background, np.float32)
+        colour = checked_background(background)
         rgb, alpha = np.empty((camera.H, camera.W, 3), np.float32), np.empty((camera.H, camera.W), np.float32)
         visible = pairs = steps = 0
         for rows in self.bands(camera):

@@ -36,7 +36,7 @@ def compare_scenes(
     Raises:
         InputError, LimitError: as in `GpuRenderer.render`; there are no views.
     """
-    colour = checked_background(background, np.float32)
+    colour = checked_background(background)
     first, second = GpuRenderer(source), GpuRenderer(other)
     shift = np.subtract(other.origin, source.origin)
     scores = []

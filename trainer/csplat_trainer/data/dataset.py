@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import ExifTags, Image
-from scipy.ndimage import map_coordinates
 
 from csplat.disk_files import read_json, read_text
 from csplat.errors import InputError, counted
@@ -19,6 +18,7 @@ from csplat.ply.ply_reader import parse_ply
 from csplat.scene_metadata import UNSPECIFIED, Direction, TrainingRecord
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
+from csplat_render.kernels import call
 from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name, printable
 from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, rgb_pixels
 from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
@@ -424,14 +424,8 @@ def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)
-    channels = [pixels[..., i].astype(np.float64) for i in range(pixels.shape[2])]
-    if len(channels) == 4:
-        channels[:3] = [channel * channels[3] for channel in channels[:3]]
-    positions = np.stack([y - 0.5, x - 0.5])  # for SciPy, the centre of the first pixel is 0
-    moved = [map_coordinates(channel, positions, order=1, mode="nearest") for channel in channels]
-    if len(moved) == 4:
-        moved[:3] = [channel / np.maximum(moved[3], _ALPHA_MIN) for channel in moved[:3]]
-    result: U8 = np.clip(np.rint(np.stack(moved, axis=2)), 0, 255).astype(np.uint8)
+    result = np.empty(pixels.shape, np.uint8)
+    call("interpolate", np.ascontiguousarray(pixels), *pixels.shape, x, y, x.size, _ALPHA_MIN, result)
     return result
 
 

@@ -19,7 +19,7 @@ from csplat_trainer.tuning.tuning_views import TuningView
 
 
 class TuningEngine(Protocol):
-    """An engine of fine-tuning, with numba kernels on the CPU or gsplat on a GPU."""
+    """An engine of fine-tuning, on the CPU, or with gsplat on a GPU."""
 
     @property
     def parameters(self) -> Parameters:
@@ -46,7 +46,7 @@ class TuningEngine(Protocol):
 
 
 class CpuTuning:
-    """An engine in numba.
+    """An engine on the CPU.
 
     Args:
         fixed: the encoder's decisions.

@@ -19,12 +19,13 @@ from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.errors import InputError
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import psnr_of_mse
+from csplat_trainer.device_measurements import make_rasteriser
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import COUNT_EVERY, FitStep, Fitter
 from csplat_trainer.image_gains import ImageGain
 from csplat_trainer.losses import PendingLoss
 from csplat_trainer.parameters import Parameters
-from csplat_trainer.training_options import MISSING_TORCH, Outputs
+from csplat_trainer.training_options import Outputs, uses_torch
 from csplat_trainer.training_report import peak_memory
 from csplat_trainer.tuned_scene import RateTerm
 from csplat_trainer.tuning.tuning_engine import CpuTuning, TuningEngine
@@ -146,7 +147,7 @@ class _Tuning:
         if (controller and controller.size_bytes) != (self._controller and self._controller.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
         for name, value in asdict(self._options).items():
-            if name not in ("iterations", "device") and checkpoint.options.get(name) != value:
+            if name not in ("iterations", "device", "engine") and checkpoint.options.get(name) != value:
                 raise InputError(f"the checkpoint is of a run with another {name}: {checkpoint.options.get(name)}")
         values = self._engine.parameters.values
         check_arrays(path, checkpoint.parameters.values, {name: tuple(array.shape) for name, array in values.items()})
@@ -214,19 +215,19 @@ class _Tuning:
         }
 
     def _make_engine(self, parameters: Parameters | None) -> TuningEngine:
-        """Return the engine of the requested device, with the state of a checkpoint or, for `None`, the initial state.
+        """Return the requested engine, with the state of a checkpoint or, for `None`, the initial state.
 
         Raises:
             InputError: a package or the GPU is absent.
         """
         fixed, options, background = self._fixed, self._options, self._views.background
-        if options.device == "cpu":
+        if not uses_torch(options.device, options.engine):
             return CpuTuning(fixed, options, background, parameters, self._context)
-        try:
-            from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
-        except ImportError:
-            raise InputError(MISSING_TORCH) from None
-        return GsplatTuning(fixed, options, background, parameters)
+        antialiased = fixed.encode_plan.model.metadata.antialiased
+        rasteriser = make_rasteriser(options.device, antialiased=antialiased, context=self._context)
+        from csplat_trainer.tuning.torch_tuning import TorchTuning
+
+        return TorchTuning(fixed, options, background, rasteriser, parameters)
 
     def _validate(self) -> None:
         """Score on the validation views, keep the best values, and end the run if it no longer improves.

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from csplat.errors import InputError
-from csplat_trainer.training_options import DEVICES, LOSSES, Device, Loss
+from csplat_trainer.training_options import DEVICES, ENGINES, LOSSES, Device, EngineName, Loss, uses_torch
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class FinetuneOptions:
     Attributes:
         iterations: steps at most, one image each.
         seed: seed of the order of the images.
-        device: `cpu` (numba) or `cuda` (the gsplat package).
+        device, engine: as in `TrainOptions`.
         loss: `inria`, `study` or `l1`, as in `TrainOptions`.
         lr_means: learning rate of the means, as a fraction of the median of the splats' middle standard deviation.
         lr_quats: learning rate of the rotations.
@@ -41,6 +41,7 @@ class FinetuneOptions:
     iterations: int = 1_000
     seed: int = 0
     device: Device = "cpu"
+    engine: EngineName = "auto"
     loss: Loss = "inria"
     lr_means: float = 0.1
     lr_quats: float = 8e-3
@@ -58,10 +59,10 @@ class FinetuneOptions:
     log_every: int = 100
 
     def __post_init__(self) -> None:
-        if self.loss not in LOSSES:
-            raise InputError(f"loss is {self.loss!r}, expected one of {', '.join(LOSSES)}")
-        if self.device not in DEVICES:
-            raise InputError(f"device is {self.device!r}, expected one of {', '.join(DEVICES)}")
+        for name, choices in (("loss", LOSSES), ("device", DEVICES), ("engine", ENGINES)):
+            if getattr(self, name) not in choices:
+                raise InputError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
+        uses_torch(self.device, self.engine)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):

@@ -127,7 +127,7 @@ def renders_of(
         background: [3], the background of the renders.
         context: threads.
     """
-    rasteriser = Rasteriser(gradients=False, context=context)
+    rasteriser = Rasteriser(context=context)
     views = []
     for camera in cameras:
         render = rasteriser.forward(source, camera, background=background, antialiased=source.metadata.antialiased).rgb

@@ -2,8 +2,8 @@
 
 Coverage lists once which tests reach which lines, function by function. Each mutant is written into a copy of the
 checkout, where the tests that reach its statement run, unmarked tests first and among these the quickest, until a test
-fails. For changes that coverage cannot see (kernels, constants of a module), tests that reach any line of the
-module take their place.
+fails. For changes that coverage cannot see (constants of a module), tests that reach any line of the module take their
+place.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class Checkout:
         text, lines = self.text(mutant.file), self.reached.get(mutant.file, {})
         begin, end = _statement(text, line)
         tests = {test for number in range(begin, end + 1) for test in lines.get(number, ())}
-        if not tests:  # a kernel, or a constant
+        if not tests:  # a constant
             tests = {test for reached in lines.values() for test in reached}
         return sorted(tests, key=lambda test: (test not in self.unmarked, self._seconds[test], test))
 
@@ -205,23 +205,19 @@ class Checkout:
         path, start = copy / mutant.file, place[1]
         try:
             path.write_text(text[:start] + mutant.new + text[start + len(mutant.old) :], "utf-8")
-            is_kernel = "jit(" in text or "njit" in text
-            by = self._failed(copy, tests[:_FIRST], is_kernel)
+            by = self._failed(copy, tests[:_FIRST])
             if not by and len(tests) > _FIRST:
-                by = self._failed(copy, tests[_FIRST:_TESTS_MAX], is_kernel)
+                by = self._failed(copy, tests[_FIRST:_TESTS_MAX])
         finally:
             path.write_text(text, "utf-8")
             copies.put(copy)
         verdict, left_out = ("caught" if by else "survived"), max(0, len(tests) - _TESTS_MAX)
         return replace(mutant, verdict=verdict, by=by, is_unmarked=by in self.unmarked, left_out=left_out)
 
-    def _failed(self, copy: Path, tests: Sequence[str], is_kernel: bool) -> str:
-        cache = copy / "out" / ("kernels-of-mutant" if is_kernel else "kernels")
-        if is_kernel:
-            shutil.rmtree(cache, ignore_errors=True)
+    def _failed(self, copy: Path, tests: Sequence[str]) -> str:
         words = ["-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--no-header", *tests]
         try:
-            ended = self._python(copy, words, _SECONDS, NUMBA_CACHE_DIR=str(cache))
+            ended = self._python(copy, words, _SECONDS)
         except subprocess.TimeoutExpired:
             return "time limit"
         if ended.returncode == 0:
@@ -229,9 +225,9 @@ class Checkout:
         failed = [line.split()[1] for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
         return failed[0].split("[")[0] if failed else "crash"
 
-    def _python(self, folder: Path, words: Sequence[str], limit: float | None, **more: str) -> Any:
+    def _python(self, folder: Path, words: Sequence[str], limit: float | None) -> Any:
         path = os.pathsep.join(str(folder / one) for one in _PATH)
-        environment = {**os.environ, "PYTHONPATH": path, "CSPLAT_DATA": "absent", **more}
+        environment = {**os.environ, "PYTHONPATH": path, "CSPLAT_DATA": "absent"}
         command = [sys.executable, *words]
         return subprocess.run(command, cwd=folder, env=environment, timeout=limit, capture_output=True, text=True)  # noqa: PLW1510, S603
 

@@ -18,6 +18,7 @@ from csplat_bench.subjects.file_parts import measure_parts
 from csplat_bench.subjects.files import measure_files
 from csplat_bench.subjects.first_bytes import measure_first_bytes
 from csplat_bench.subjects.gpu_rendering import measure_gpu
+from csplat_bench.subjects.kernel_times import measure_kernels
 from csplat_bench.subjects.large_scenes import measure_commands
 from csplat_bench.subjects.level_quality import measure_levels
 from csplat_bench.subjects.photographs import measure_photographs
@@ -39,6 +40,7 @@ SUBJECTS: dict[str, Subject] = {
     "files": measure_files,
     "first_bytes": measure_first_bytes,
     "gpu_rendering": measure_gpu,
+    "kernel_times": measure_kernels,
     "large_scenes": measure_commands,
     "level_quality": measure_levels,
     "photographs": measure_photographs,

@@ -36,7 +36,7 @@ def measure_first_bytes(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[
     model = csplat.read(find_scene(name, setup.data, setup.work).path)
     files = {False: csplat.encode(model), True: csplat.encode(model, levels=FittedLevelBuilder())}
     cameras = comparison_cameras(model)
-    rasteriser = Rasteriser(gradients=False)
+    rasteriser = Rasteriser()
 
     def render(splats: SplatModel) -> list[Any]:
         return [

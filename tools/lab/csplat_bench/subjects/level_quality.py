@@ -47,7 +47,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
     model, cameras = _scene(setup, name)
     source = setup.work / f"{Path(name).stem}-levels.ply"
     write_ply(source, model)
-    rasteriser = Rasteriser(gradients=False)
+    rasteriser = Rasteriser()
 
     def render(splats: SplatModel, camera: Camera) -> np.ndarray:
         return rasteriser.forward(splats, camera, antialiased=splats.metadata.antialiased).rgb.clip(0.0, 1.0)

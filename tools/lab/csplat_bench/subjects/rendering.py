@@ -22,8 +22,6 @@ from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_render.warmup import warm_up
-from csplat_tools.console import note
 from csplat_tools.views import comparison_cameras
 
 
@@ -31,23 +29,21 @@ from csplat_tools.views import comparison_cameras
 def measure_rendering(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that renders all views once, with and without gradients."""
     scene, context = find_scene(name, setup.data, setup.work), Context(threads=setup.options["threads"])
-    warm_up(note)
     model = read_ply(scene.path)
     cameras = list(scene.cameras or comparison_cameras(model))[: setup.options["views"]]
-    standard = Rasteriser("standard", gradients=False, context=context)
+    standard = Rasteriser(context=context)
     references = [standard.forward(model, camera).rgb.clip(0.0, 1.0) for camera in cameras]
 
     def measure(case: Case) -> Mapping[str, Any]:
         mode, antialiased = case["mode"], case.get("antialiased", False)
-        plain, training = (Rasteriser(mode, gradients=gradients, context=context) for gradients in (False, True))
+        rasteriser = Rasteriser(mode, context=context)
         forward, backward, drawn, errors = list[Timing](), list[Timing](), list[int](), list[float]()
         for camera, reference in zip(cameras, references, strict=True):
-            render, timing = timed(plain.forward, model, camera, antialiased=antialiased)
+            render, timing = timed(rasteriser.forward, model, camera, antialiased=antialiased)
             forward.append(timing)
             drawn.append(render.drawn)
             errors.append(float(np.mean((render.rgb.clip(0.0, 1.0) - reference) ** 2)))
-            training.forward(model, camera, antialiased=antialiased)
-            backward.append(timed(training.backward, np.ones_like(render.rgb))[1])
+            backward.append(timed(rasteriser.backward, np.ones_like(render.rgb))[1])
         error = float(np.mean(errors))
         return {
             "splats": len(model), "sh_degree": model.sh_degree, "in_view": int(statistics.median(drawn)),

@@ -1,5 +1,7 @@
 """Steps of training: milliseconds by stage, and memory, in a process of its own.
 
+Stages are the forward pass, the loss, and `descend`, the gradients with the step of Adam.
+
 A scene is COUNT:WxH: splats, and the size of the images of option `data_set`. Splats start as in training, with SH
 degree 3; option `warm` steps make their sizes realistic, then `steps` steps are timed. Memory is the largest growth of
 the process after the images were read. A case may set `threads`.
@@ -26,13 +28,12 @@ from csplat_render.kernels import thread_count
 from csplat_trainer.data import load
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.initial_splats import measure_extent, place_splats
-from csplat_trainer.parameters import Parameters, adam_step
+from csplat_trainer.parameters import Parameters
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.training_options import TrainOptions
 
-_STAGES = ("forward", "loss", "backward", "adam", "other")
+_STAGES = ("forward", "loss", "descend", "other")
 _DEGREE = 3
-_COMPILE_SPLATS = 10  # enough to compile everything that a step runs
 
 
 @contextmanager
@@ -61,18 +62,14 @@ def time_steps(
     options = TrainOptions(max_splats=count, sh_degree=_DEGREE, strategy="fixed", iterations=warm + steps)
     rng, scene = np.random.default_rng(0), measure_extent(images)
 
-    def start(splats: int) -> Parameters:
-        return Parameters.starting_at(place_splats(images, scene, splats, _DEGREE, rng))
-
     with thread_count(threads):
-        # The engines of compiling and warming up stay alive: memory that they freed would be reused without being seen.
-        compiled = _walk(images[:1], options, start(_COMPILE_SPLATS), 2)
+        # The engine of warming up stays alive: memory that it freed would be reused without being seen.
         before = reset_peak()
-        parameters = start(count)
+        parameters = Parameters.starting_at(place_splats(images, scene, count, _DEGREE, rng))
         warmed = _walk(images, options, parameters, warm)
         times, errors, _ = _walk(images, options, parameters, steps)
     growth = peak_bytes() - before
-    del compiled, warmed
+    del warmed
     return {
         "splats": count, "width": size[0], "height": size[1], "memory_bytes": growth,
         **{f"{name}_ms": 1e3 * statistics.median(values) for name, values in times.items()},
@@ -107,8 +104,7 @@ def _walk(
     errors, background = [], np.ones(3, np.float32)
     with (
         patch.object(rasteriser, "forward", clock("forward", rasteriser.forward)),
-        patch.object(rasteriser, "backward", clock("backward", rasteriser.backward)),
-        patch("csplat_trainer.engine.adam_step", clock("adam", adam_step)),
+        patch.object(rasteriser, "descend", clock("descend", rasteriser.descend)),
         patch.object(losses, "of", clock_loss),
     ):
         for step in range(steps):

@@ -1,0 +1,1 @@
+"""The compiled library of the renderer, and its sources: `build` compiles them."""
