@@ -118,7 +118,7 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
-		.import_linter_cache
+		.import_linter_cache trainer/csplat_render/native/csplat_native*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:

@@ -167,7 +167,7 @@ def _library() -> tuple[str, ctypes.CDLL]:
     if wanted:
         raise InputError(f"{SET_VARIABLE} is {wanted!r}, expected one that this installation and processor have")
     if paths:
-        raise InputError("the renderer requires a processor with AVX2, FMA and BMI2 (x86-64-v3), or with NEON")
+        raise InputError("the renderer requires a processor with AVX2 and FMA (x86-64-v3), or with NEON")
     raise InputError(
         "this installation of csplat has no compiled renderer: install a wheel for this platform, or a C++ compiler "
         "and csplat again"

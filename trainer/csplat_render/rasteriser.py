@@ -201,8 +201,7 @@ class Rasteriser:
             rgb = np.empty((*size, 3), np.float32)
             transmittance, depth = np.empty(size, np.float32), np.empty(size, np.float32)
             call("render", self._handle, p.c_view, len(p.splats.means), state, rgb, transmittance, depth)
-        if state is not None:
-            self._last = None  # gradients require all splats at once
+        self._last = p if state is None else None  # gradients require all splats at once
         return RenderResult(rgb, 1 - transmittance, depth, p.radii, p.drawn, p.intersections, p.ignored)
 
     def initial_state(self, camera: Camera) -> F32:
@@ -237,11 +236,7 @@ class Rasteriser:
         g_rgb = _checked_gradient("grad_rgb", grad_rgb, (*last.size, 3))
         g_alpha = None if grad_alpha is None else _checked_gradient("grad_alpha", grad_alpha, last.size)
         g_depth = None if grad_depth is None else _checked_gradient("grad_depth", grad_depth, last.size)
-        a, old = last.splats, self._gradients
-        if old is None or old.shN.shape != a.shN.shape:
-            arrays = {name: np.empty_like(array) for name, array in vars(a).items()}
-            old = Gradients(**arrays, means2d=np.empty_like(a.opacities), radii=last.radii)
-        g = self._gradients = replace(old, radii=last.radii)
+        g = self._gradients_of(last)
         with thread_count(self.context.threads):
             call(
                 "gradients", self._handle, last.c_splats, last.c_view, g_rgb, g_alpha, g_depth,
@@ -258,7 +253,8 @@ class Rasteriser:
         """
         last = self._last_projection()
         assert last.c_splats.logits
-        self._step(last, step, None, _checked_gradient("the gradient", gradient, (*last.size, 3)))
+        slope = _checked_gradient("the gradient", gradient, (*last.size, 3))
+        self._step(last, step, None, slope)
         self._last = None
 
     def refit(
@@ -287,8 +283,37 @@ class Rasteriser:
         target = _checked_gradient("the reference", reference, (camera.H, camera.W, 3))
         with thread_count(self.context.threads):
             p = self._project(splats, camera, background, antialiased=antialiased, logits=True, counts=False)
-        self._last = None
         return self._step(p, step, target, None)
+
+    def error_gradients(
+        self,
+        splats: HasSplats,
+        camera: Camera,
+        reference: F32,
+        *,
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        antialiased: bool = False,
+    ) -> tuple[float, Gradients]:
+        """Compute the gradients of half the squared error of a render, in one pass over the image, as `refit` does.
+
+        Args:
+            splats, camera, background, antialiased: as for `forward`.
+            reference: [H, W, 3].
+
+        Returns:
+            The sum of squared errors, and the gradients; those of means are 0.
+        """
+        target = _checked_gradient("the reference", reference, (camera.H, camera.W, 3))
+        error = np.zeros(1)
+        with thread_count(self.context.threads):
+            p = self._project(splats, camera, background, antialiased=antialiased, counts=False)
+            g = self._gradients_of(p)
+            g.means[:], g.means2d[:] = 0.0, 0.0
+            call(
+                "error_gradients", self._handle, p.c_splats, p.c_view, target, error,
+                g.quats, g.scales, g.opacities, g.sh0, g.shN,
+            )  # fmt: skip
+        return float(error[0]), g
 
     def measure_pruning(
         self,
@@ -314,7 +339,6 @@ class Rasteriser:
         with thread_count(self.context.threads):
             p = self._project(splats, camera, background, antialiased=antialiased, counts=False)
             call("measure_pruning", self._handle, p.c_view, len(p.splats.means), rgb, errors, seen)
-        self._last = None
         return rgb
 
     def add_derivatives(
@@ -335,7 +359,6 @@ class Rasteriser:
         with thread_count(self.context.threads):
             p = self._project(splats, camera, background, antialiased=antialiased, counts=False)
             call("add_derivatives", self._handle, p.c_splats, p.c_view, *sums)
-        self._last = None
 
     def _project(
         self,
@@ -368,9 +391,9 @@ class Rasteriser:
         total = call("project", self._handle, c_splats, c_view, *((radii, found) if counts else (None, None)))
         if total > MAX_INTERSECTIONS:
             raise LimitError("MAX_INTERSECTIONS", total, MAX_INTERSECTIONS)
+        self._last = None
         size = (camera.H, camera.W)
-        self._last = _Projection(a, c_splats, c_view, size, radii, int(found[0]), total, int(found[1]))
-        return self._last
+        return _Projection(a, c_splats, c_view, size, radii, int(found[0]), total, int(found[1]))
 
     def _last_projection(self) -> _Projection:
         """Return the last `forward`; raise an `InputError` if there is none, or it was a slice."""
@@ -378,11 +401,20 @@ class Rasteriser:
             raise InputError("gradients require a forward of all splats before them")
         return self._last
 
-    def _step(self, p: _Projection, step: AdamStep, reference: F32 | None, gradient: F32 | None) -> float:
-        """Make a step, and return the squared error, 0 without a reference."""
+    def _gradients_of(self, p: _Projection) -> Gradients:
+        """Return arrays for the gradients of splats, those of the last call if they fit."""
+        old = self._gradients
+        if old is None or old.shN.shape != p.splats.shN.shape:
+            arrays = {name: np.empty_like(array) for name, array in vars(p.splats).items()}
+            old = Gradients(**arrays, means2d=np.empty_like(p.splats.opacities), radii=p.radii)
+        self._gradients = replace(old, radii=p.radii)
+        return self._gradients
+
+    def _step(self, p: _Projection, step: AdamStep, *arrays: F32 | None) -> float:
+        """Make a step, and return the squared error, 0 without a reference; `arrays` are those of `csplat_step`."""
         error = np.zeros(1)
         with thread_count(self.context.threads):
-            call("step", self._handle, p.c_splats, p.c_view, reference, gradient, step.as_c(), error)
+            call("step", self._handle, p.c_splats, p.c_view, *arrays, step.as_c(), error)
         return float(error[0])
 
 

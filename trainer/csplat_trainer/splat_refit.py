@@ -143,8 +143,11 @@ class _TrainingViews:
 
     def gradients(self, splats: HasSplats, view: int) -> tuple[float, Gradients]:
         """Return the mean squared error of a view's render, and the gradients of half its sum."""
-        error = self._error_image(splats, view)
-        return float(np.vdot(error, error)) / max(1, error.size), self._rasteriser.backward(error)
+        reference = self._references[view]
+        error, gradients = self._rasteriser.error_gradients(
+            splats, self._cameras[view], reference, background=self._background, antialiased=self._antialiased
+        )
+        return error / max(1, reference.size), gradients
 
     def refit(self, splats: UncheckedSplats, view: int, step: AdamStep) -> float:
         """Make a step on splats with logits along the gradient of half the squared error; return the mean before."""

@@ -74,11 +74,10 @@ struct Exponents {
 };
 
 struct Limits {
-  float exponent, alpha_min, transmittance_min;
+  float exponent, transmittance_min;  // least exponent of 2 of alpha, and least transmittance
 
   explicit Limits(const View& view)
-      : exponent(static_cast<float>(csplat::log2(view.alpha_min)) - kMargin),
-        alpha_min(static_cast<float>(view.alpha_min)),
+      : exponent(static_cast<float>(csplat::log2(view.alpha_min))),
         transmittance_min(static_cast<float>(view.transmittance_min)) {}
 };
 
@@ -174,9 +173,10 @@ float* blend_splat(const Exponents& e, const Limits& limits, Tile& tile, float* 
     const Floats x = load(kPositions.lane_x + lanes), y = load(kPositions.lane_y + lanes);
     const Floats rest_of_sum = fma(all(e.y_slope[square]), y, load(e.bend + lanes) + all(e.constant[square]));
     const Floats exponent = fma(all(e.x_slope[square]), x, rest_of_sum);
-    if (!bits(at_least(exponent, all(limits.exponent)))) continue;
-    const Floats full = exp2(exponent), before = load(tile.transmittance + place);
-    const Floats alpha = keep(at_least(full, all(limits.alpha_min)), smaller(full, all(kAlphaCap)));
+    const Mask seen = at_least(exponent, all(limits.exponent));
+    if (!bits(seen)) continue;
+    const Floats alpha = keep(seen, smaller(exp2_within(exponent), all(kAlphaCap)));
+    const Floats before = load(tile.transmittance + place);
     const Floats weight_if_going = before * alpha;
     const Mask going = at_least(before - weight_if_going, all(limits.transmittance_min));
     const Floats weight = keep(going, weight_if_going), after = negate_outside(going, before - weight);
@@ -217,7 +217,7 @@ Blended blend_tile(const Renderer& renderer, const Limits& limits, int index, Ti
     const int size = std::min(kBatch, count - used);
     for (int n = 0; n < size; n++) {
       if (used + n + kBatch < count) __builtin_prefetch(&renderer.splats[pairs[used + n + kBatch].splat]);
-      expand(renderer.splats[pairs[used + n].splat], tile, limits.exponent, batch[n]);
+      expand(renderer.splats[pairs[used + n].splat], tile, limits.exponent - kMargin, batch[n]);
     }
     if (kKeep) scratch.kept.reserve(kept + kBatch * kMostKept, kept);
     float* to = scratch.kept.data() + kept;

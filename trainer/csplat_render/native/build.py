@@ -30,12 +30,13 @@ SOURCES = Path(__file__).resolve().parent
 ZIG = "ziglang>=0.13"
 
 _MACOS = "11.0"  # the oldest system on which the library runs
-_AVX2 = ("avx2", "fma", "bmi", "bmi2", "popcnt")
-_FEATURES = {  # instructions that each set uses; `csplat_supported` looks for the same
-    "avx512": (*_AVX2, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
-    "avx2": _AVX2,
-    "neon": (),
-    "portable": ("fma",),  # vectors_portable.h on x86-64, for tests
+_V3 = ("avx2", "fma", "bmi", "bmi2", "popcnt", "lzcnt", "movbe", "f16c")
+_V4 = (*_V3, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")
+_TARGETS = {  # of each set: instructions, which `csplat_supported` looks for, and what Zig calls them
+    "avx512": (_V4, "x86_64_v4"),
+    "avx2": (_V3, "x86_64_v3"),
+    "neon": ((), "baseline"),
+    "portable": (("fma",), "baseline+fma"),  # vectors_portable.h on x86-64, for tests
 }
 _SETS = {"x86_64": ("avx512", "avx2"), "aarch64": ("neon",)}
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -143,8 +144,8 @@ def _compile(sets: Sequence[str], sanitizers: str, scratch: Path) -> None:
     for name in sets:
         for source in sorted(SOURCES.glob("*.cpp")):
             # Functions about the library itself must run on any processor.
-            features = () if source.stem == "library" else _FEATURES[name]
-            flags = [f"-mcpu={'+'.join(('baseline', *features))}"] if is_zig else [f"-m{one}" for one in features]
+            features, cpu = ((), "baseline") if source.stem == "library" else _TARGETS[name]
+            flags = [f"-mcpu={cpu}"] if is_zig else [f"-m{feature}" for feature in features]
             flags += [f"-DCSPLAT_{name.upper()}", *(_WIDE if name == "avx512" else ())]
             jobs.append([*command, *flags, "-c", str(source), "-o", str(scratch / f"{name}-{source.stem}.o")])
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -198,7 +199,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=SOURCES, help="Default: next to the sources")
     parser.add_argument("--sanitize", default="", help="values of -fsanitize, separated by commas")
-    parser.add_argument("--sets", default="", help=f"of {', '.join(_FEATURES)}. Default: the machine's")
+    parser.add_argument("--sets", default="", help=f"of {', '.join(_TARGETS)}. Default: the machine's")
     parser.add_argument("--requires", action="store_true", help="print the package to install first, if any")
     arguments = parser.parse_args()
     try:

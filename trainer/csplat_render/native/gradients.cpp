@@ -374,7 +374,7 @@ void regularise(const Splats& splats, int64_t block, const Weights& weights, Blo
 // Writes the records of all tiles, and returns the squared error if there is a reference.
 double blend_gradients(int64_t threads, Renderer& renderer, const View& view, const ImageGradients& image,
                        const float* reference) {
-  if (static_cast<int64_t>(renderer.scratch.size()) < threads) renderer.scratch.resize(threads);
+  renderer.reserve_scratch(threads);
   renderer.records.reserve(kSums * renderer.pair_count);
   parallel(threads, view.tile_count(), [&](int64_t index, int thread) {
     const auto pass = image.depth ? tile_gradients<true> : tile_gradients<false>;
@@ -385,6 +385,32 @@ double blend_gradients(int64_t threads, Renderer& renderer, const View& view, co
   return error;
 }
 
+// Gradients of splats, see `Gradients` in csplat_render.conventions.
+struct SplatGradients { float *means, *quats, *scales, *opacities, *sh0, *shN, *means2d; };
+
+void project_gradients(int64_t threads, const Renderer& renderer, const Splats& splats, const View& view,
+                       const SplatGradients& to) {
+  for_each_block(threads, splats.blocks(), [&](int64_t block) {
+    const int64_t first = block * kBlock, count = std::min<int64_t>(kBlock, splats.count - first);
+    BlockGradients g;
+    const bool drawn = renderer.drawn[block];
+    if (drawn) block_gradients(renderer, splats, view, block, to.means, g);
+    const auto write = [&](float* rows, const float* from, int64_t width) {
+      if (rows && drawn)
+        std::copy(from, from + width * count, rows + width * first);
+      else if (rows)
+        std::fill(rows + width * first, rows + width * (first + count), 0.0f);
+    };
+    write(to.means, g.means, 3);
+    write(to.quats, g.quats, 4);
+    write(to.scales, g.scales, 3);
+    write(to.opacities, g.opacities, 1);
+    write(to.sh0, g.sh0, 3);
+    write(to.shN, g.shN, 3 * splats.coefficients);
+    write(to.means2d, g.means2d, 1);
+  });
+}
+
 }  // namespace
 }  // namespace csplat
 
@@ -392,34 +418,28 @@ using namespace csplat;
 
 // Computes the gradients of a loss, after `csplat_render` of the same splats.
 //
-// rgb: [H, W, 3], alpha and depth: [H, W] or null, the gradients of the images. The other arrays are written, see
-// `Gradients` in csplat_render.conventions.
+// rgb, alpha, depth: [H, W, 3], [H, W] or null, the gradients of the images. The other arrays are written.
 CSPLAT_API int64_t csplat_gradients(int64_t threads, Renderer* renderer, const Splats* splats, const View* view,
                                     const float* rgb, const float* alpha, const float* depth, float* means,
                                     float* quats, float* scales, float* opacities, float* sh0, float* shN,
                                     float* means2d) {
   return guarded([&]() -> int64_t {
     blend_gradients(threads, *renderer, *view, {rgb, alpha, depth}, nullptr);
-    for_each_block(threads, splats->blocks(), [&](int64_t block) {
-      const int64_t first = block * kBlock, count = std::min<int64_t>(kBlock, splats->count - first);
-      const int64_t row = 3 * splats->coefficients;
-      BlockGradients g;
-      const bool drawn = renderer->drawn[block];
-      if (drawn) block_gradients(*renderer, *splats, *view, block, true, g);
-      const auto write = [&](float* to, const float* from, int64_t width) {
-        if (drawn)
-          std::copy(from, from + width * count, to + width * first);
-        else
-          std::fill(to + width * first, to + width * (first + count), 0.0f);
-      };
-      write(means, g.means, 3);
-      write(quats, g.quats, 4);
-      write(scales, g.scales, 3);
-      write(opacities, g.opacities, 1);
-      write(sh0, g.sh0, 3);
-      write(shN, g.shN, row);
-      write(means2d, g.means2d, 1);
-    });
+    project_gradients(threads, *renderer, *splats, *view, {means, quats, scales, opacities, sh0, shN, means2d});
+    return 0;
+  });
+}
+
+// Computes the gradients of half the squared error of a view, after `csplat_project`; without those of means.
+//
+// reference: [H, W, 3]. error: [1], written: the squared error.
+CSPLAT_API int64_t csplat_error_gradients(int64_t threads, Renderer* renderer, const Splats* splats, const View* view,
+                                          const float* reference, double* error, float* quats, float* scales,
+                                          float* opacities, float* sh0, float* shN) {
+  return guarded([&]() -> int64_t {
+    bin(threads, *renderer, *view, splats->count);
+    *error = blend_gradients(threads, *renderer, *view, {nullptr, nullptr, nullptr}, reference);
+    project_gradients(threads, *renderer, *splats, *view, {nullptr, quats, scales, opacities, sh0, shN, nullptr});
     return 0;
   });
 }

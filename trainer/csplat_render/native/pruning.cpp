@@ -59,7 +59,7 @@ CSPLAT_API int64_t csplat_measure_pruning(int64_t threads, Renderer* renderer, c
                                           float* rgb, double* errors, uint8_t* seen) {
   return guarded([&]() -> int64_t {
     bin(threads, *renderer, *view, count);
-    if (static_cast<int64_t>(renderer->scratch.size()) < threads) renderer->scratch.resize(threads);
+    renderer->reserve_scratch(threads);
     renderer->records.reserve(kSums * renderer->pair_count);
     parallel(threads, view->tile_count(), [&](int64_t index, int thread) {
       measure_tile(*renderer, *view, static_cast<int>(index), rgb, renderer->scratch[thread]);

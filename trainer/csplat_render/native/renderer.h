@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
 #include <new>
 #include <vector>
@@ -62,7 +61,7 @@ template <typename T>
 class Array {
  public:
   Array() = default;
-  ~Array() { std::free(data_); }
+  ~Array() { free(); }
   Array(Array&& other) noexcept : data_(other.data_), size_(other.size_) { other.data_ = nullptr; }
   Array(const Array&) = delete;
   Array& operator=(const Array&) = delete;
@@ -71,10 +70,9 @@ class Array {
   void reserve(size_t size, size_t kept = 0) {
     if (size <= size_) return;
     size = std::max(size, size_ + size_ / 4);
-    T* data = static_cast<T*>(std::aligned_alloc(64, (size * sizeof(T) + 63) / 64 * 64));
-    if (!data) throw std::bad_alloc();
+    T* data = static_cast<T*>(::operator new(size * sizeof(T), kAlignment));
     if (kept) std::memcpy(static_cast<void*>(data), data_, kept * sizeof(T));
-    std::free(data_);
+    free();
     data_ = data;
     size_ = size;
   }
@@ -88,6 +86,11 @@ class Array {
   const T* data() const { return data_; }
 
  private:
+  static constexpr std::align_val_t kAlignment{64};
+  void free() {
+    if (data_) ::operator delete(data_, kAlignment);
+  }
+
   T* data_ = nullptr;
   size_t size_ = 0;
 };
@@ -130,6 +133,10 @@ struct Renderer {
   Array<double> errors;         // squared error of each tile
   std::vector<Scratch> scratch;
   int64_t drawn_count = 0, pair_count = 0;
+
+  void reserve_scratch(int64_t threads) {
+    if (static_cast<int64_t>(scratch.size()) < threads) scratch.resize(threads);
+  }
 };
 
 // Calls function(block) for all blocks, 16 adjacent blocks at a time.

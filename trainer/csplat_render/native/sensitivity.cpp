@@ -197,7 +197,7 @@ CSPLAT_API int64_t csplat_add_derivatives(int64_t threads, Renderer* renderer, c
                                           float* metric, double* shape_matrices, int64_t* views) {
   return guarded([&]() -> int64_t {
     bin(threads, *renderer, *view, splats->count);
-    if (static_cast<int64_t>(renderer->scratch.size()) < threads) renderer->scratch.resize(threads);
+    renderer->reserve_scratch(threads);
     renderer->records.reserve(static_cast<size_t>(kSums) * renderer->pair_count);
     for_each_block(threads, splats->blocks(), [&](int64_t block) {
       if (renderer->drawn[block]) block_forms(*renderer, *splats, *view, block, forms);

@@ -27,12 +27,12 @@ inline Doubles as_doubles(Longs a) { return {reinterpret_cast<decltype(Doubles::
 inline Floats operator-(Floats a) { return all(-0.0f) - a; }
 inline Doubles operator-(Doubles a) { return all(-0.0) - a; }
 
-// Returns 2**x for x < 127, with a relative error of 2e-7; smaller x than −120 count as −120.
+// Returns 2**x for −120 <= x < 127, with a relative error of 2e-7.
 //
 // 2**x = 2**n · 2**f with n an integer and |f| <= 1/2; 2**f is a polynomial fitted for minimal relative error. Adding
 // 1.5 · 2**23 rounds x to n and leaves n in the low bits.
-inline Floats exp2(Floats x) {
-  const Floats magic = all(12582912.0f), t = larger(x, all(-120.0f)), shifted = t + magic, f = t - (shifted - magic);
+inline Floats exp2_within(Floats x) {
+  const Floats magic = all(12582912.0f), shifted = x + magic, f = x - (shifted - magic);
   Floats p = all(0.0013275470569714626f);
   for (const float c : {0.009684186484357147f, 0.05550791318132806f, 0.24021906575261626f, 0.6931468253392489f,
                         1.0000001353333114f})
@@ -40,7 +40,7 @@ inline Floats exp2(Floats x) {
   return add_to_exponent(p, shifted);
 }
 
-// Returns e**x for |x| < 700, with a relative error of 1e-14: as `exp2`, with the Taylor series of e**(f ln 2).
+// Returns e**x for |x| < 700, with a relative error of 1e-14: as `exp2_within`, with the Taylor series of e**(f ln 2).
 inline Doubles exp(Doubles x) {
   const Doubles magic = all(6755399441055744.0);  // 1.5 · 2**52
   const Doubles t = x * all(1.4426950408889634);
