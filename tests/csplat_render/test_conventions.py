@@ -2,6 +2,8 @@
 
 import itertools
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import oracle
@@ -11,7 +13,7 @@ from rasteriser_cases import camera, one_splat
 from tables import failures
 
 from csplat.errors import LimitError
-from csplat_render import rasteriser, render
+from csplat_render import conventions, rasteriser, render
 from csplat_render.conventions import DILATION, UncheckedSplats
 
 
@@ -46,6 +48,13 @@ def assert_survives(case):
     assert off.mean() <= 2e-3
     assert exact.ignored == picture.ignored
     return picture
+
+
+def test_the_compiled_library_has_the_constants_of_the_reference():
+    header = (Path(__file__).resolve().parents[2] / "trainer/csplat_render/native/renderer.h").read_text("utf-8")
+    for name in ("DILATION", "ALPHA_CAP", "LOG_SCALE_LIMIT", "COMPENSATION_MIN"):
+        camel = "k" + name.title().replace("_", "")
+        assert getattr(conventions, name) == float(re.search(rf"{camel} = ([\d.e-]+)f?;", header)[1])
 
 
 def more_adversarial():

@@ -5,6 +5,7 @@ Also: csplat_render.reference_rasteriser.
 
 import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +16,10 @@ from oracle import VIEW, extreme_splats, facing, random_gradients, random_splats
 from rasteriser_cases import camera
 
 from csplat.context import Context
-from csplat.errors import InputError
+from csplat.errors import InputError, LimitError
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply
-from csplat_render import render
+from csplat_render import rasteriser, render
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
@@ -93,8 +94,8 @@ def test_neither_threads_nor_earlier_renders_change_a_bit():
     used = Rasteriser()
     first = used.forward(scene(count=4000, degree=1, seed=5), camera(200, 150)).rgb
     kept, wanted = first.copy(), outcome(Rasteriser(context=Context(threads=1)))
-    for rasteriser in (Rasteriser(context=Context(threads=2)), used):
-        assert all(map(np.array_equal, wanted, outcome(rasteriser)))
+    for other in (Rasteriser(context=Context(threads=2)), used):
+        assert all(map(np.array_equal, wanted, outcome(other)))
     np.testing.assert_array_equal(kept, first)  # results belong to the caller
 
 
@@ -178,3 +179,18 @@ def test_ignored_sh_bands_have_no_gradient():
     shN = gradients(random_splats(6, 3, seed=5), sh_degree=1).shN
     assert np.abs(shN[:, :3]).max() > 0.0
     assert not shN[:, 3:].any()
+
+
+def test_calls_of_several_threads_wait_for_each_other_and_a_failed_call_leaves_nothing_for_gradients(monkeypatch):
+    small, large, view = scene(count=20), scene(count=3000), camera(100, 75)
+    shared, wanted = Rasteriser(), {id(model): Rasteriser().forward(model, view).rgb for model in (small, large)}
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda model: (id(model), shared.forward(model, view).rgb), [small, large] * 10))
+    for number, rgb in found:
+        np.testing.assert_array_equal(wanted[number], rgb)
+    monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
+    with pytest.raises(LimitError):
+        shared.forward(large, view)
+    assert np.count_nonzero(shared.find_visible(large, view).near)  # for slices, without a limit
+    with pytest.raises(InputError, match="forward"):
+        shared.backward(np.zeros((75, 100, 3)))

@@ -69,7 +69,7 @@ def thresholds_of(mode: str) -> tuple[float, float]:
 
 
 def view_vector(camera: Camera) -> NDArray[np.float64]:
-    """Return the parameters of a camera for the kernels.
+    """Return the parameters of a camera for the compiled library.
 
     Returns:
         [24] float64: rotation (9, row by row), translation, fx, fy, cx, cy, near plane, bounds of x/z and of y/z within
@@ -217,13 +217,13 @@ class VisibleSplats:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a loss with respect to the splats; the rasteriser's next `backward` overwrites the arrays.
+    """Gradients of a loss with respect to the splats; the rasteriser's next gradients overwrite the arrays.
 
     Attributes:
         means: [N, 3].
         quats: [N, 4], through the normalisation.
         scales: [N, 3], with respect to the logarithms.
-        opacities: [N], with respect to alpha.
+        opacities: [N], with respect to alpha, or to logits if these were rendered.
         sh0: [N, 3].
         shN: [N, K, 3], 0 above the rendered degree.
         means2d: [N], norm of the gradient with respect to the centre on the image, per pixel.

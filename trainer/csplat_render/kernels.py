@@ -1,6 +1,6 @@
 """Call the functions of the compiled library `native`, on threads.
 
-No result depends on the number of threads, nor on the instruction set of the processor.
+No result depends on the number of threads; nor, for finite numbers, on the instruction set of the processor.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
     """
     if threads is not None and threads < 1:
         raise InputError(f"threads is {threads}, expected 1 or more")
-    before = _limit()
+    before = getattr(_local, "limit", None)
     if threads is not None:
         _local.limit = min(threads, available_threads())
     try:
@@ -120,7 +120,7 @@ _local = threading.local()
 
 def _limit() -> int:
     """Return the number of threads for calls by this thread."""
-    limit: int = getattr(_local, "limit", 0) or available_threads()
+    limit: int = getattr(_local, "limit", None) or available_threads()
     return limit
 
 

@@ -24,6 +24,7 @@ C1, C2 = 0.01**2, 0.03**2
 RADIUS = 5  #: pixels from the centre of the window to its edge
 
 _SIGMA = 1.5  # pixels
+_PANEL = 32  # outputs whose weights lie together, as in native/images.cpp
 
 
 def _window() -> F64:
@@ -45,9 +46,9 @@ def mean_ssim(x: F64, y: F64) -> float:
     """
     assert x.dtype == y.dtype == np.float64
     assert x.shape == y.shape
-    sums = np.empty(1, np.float64)
+    sums = np.empty(3, np.float64)
     kernels.call("ssim", x, y, len(x), x[0].size, sums)
-    return float(sums[0]) / x.size
+    return float(sums[1]) / x.size
 
 
 def mean_ssim_twin(x: F64, y: F64) -> float:
@@ -84,13 +85,16 @@ def convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
     height, width, inputs, outputs = kernel.shape
     padded = np.pad(np.ascontiguousarray(x, np.float32), ((padding, padding), (padding, padding), (0, 0)))
     rows, columns = ((size - k) // stride + 1 for size, k in zip(padded.shape, (height, width), strict=False))
-    weights, offsets = np.ascontiguousarray(kernel, np.float32), np.ascontiguousarray(bias, np.float32)
-    result = np.empty((rows, columns, outputs), np.float32)
+    more = -outputs % _PANEL
+    weights = np.pad(kernel.astype(np.float32, copy=False).reshape(-1, outputs), ((0, 0), (0, more)))
+    panels = np.ascontiguousarray(weights.reshape(len(weights), -1, _PANEL).swapaxes(0, 1))
+    offsets = np.pad(bias.astype(np.float32), (0, more))
+    result = np.empty((rows, columns, len(offsets)), np.float32)
     # A row of the kernel is contiguous in a row of the image.
     image = padded, padded[0].size
-    taps = weights, offsets, height, width * inputs, outputs
+    taps = panels, offsets, height, width * inputs, len(offsets)
     kernels.call("convolve", *image, *taps, stride, stride * inputs, rows, columns, result)
-    return result
+    return np.ascontiguousarray(result[..., :outputs])
 
 
 def convolve_twin(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> NDArray[np.float64]:

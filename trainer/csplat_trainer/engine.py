@@ -115,7 +115,7 @@ class CpuEngine:
         options, camera = self._options, image.camera
         loss, target = self._losses.of(camera)
         compose(image, background, target)
-        rgb = self._forward(camera, background, degree)
+        rgb = self.render(camera, background, degree)
         shown = rgb if gain is None else gain.apply(rgb)
         value, slope = loss(shown, target, image.mask)
         if self._perceptual is not None:
@@ -141,16 +141,7 @@ class CpuEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the current state, [H, W, 3], into a buffer that the next render overwrites."""
-        return self._forward(camera, background, degree)
-
-    def measure_pruning(self, cameras: Sequence[Camera], background: F32) -> PruningError:
-        """Measure the pruning errors of the splats in some views; arguments as for `measure_pruning_error`."""
-        model = to_model(self.parameters.values, antialiased=self._options.antialiased)
-        return measure_pruning_error(model, cameras, background=background, context=self._context)
-
-    def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the current state, [H, W, 3], for `step`."""
+        """Render the current state, [H, W, 3]; keeps the radii for `step`."""
         v = self.parameters.values
         splats = UncheckedSplats(v["means"], v["quats"], v["scales"], v["logits"], v["sh0"], v["shN"])
         result = self._rasteriser.forward(
@@ -158,6 +149,11 @@ class CpuEngine:
         )
         self._radii = result.radii
         return result.rgb
+
+    def measure_pruning(self, cameras: Sequence[Camera], background: F32) -> PruningError:
+        """Measure the pruning errors of the splats in some views; arguments as for `measure_pruning_error`."""
+        model = to_model(self.parameters.values, antialiased=self._options.antialiased)
+        return measure_pruning_error(model, cameras, background=background, context=self._context)
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:

@@ -16,12 +16,12 @@ from csplat.model import SplatModel, normalise_quats
 from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32
 from csplat_render import kernels
-from csplat_render.rasteriser import AdamStep
+from csplat_render.rasteriser import FITTED, AdamStep
 
 ParameterArrays = dict[str, F32]
 
 #: Names of the arrays of `ParameterArrays`, in the order in which they are processed.
-GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
+GROUPS = FITTED
 
 _BETA1 = 0.9  # decay of the mean of gradients in a step, as in native/adam.h
 _ALPHA_MARGIN = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
@@ -142,6 +142,7 @@ def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatMode
 
 def sigmoid(logits: F32) -> F32:
     """Return the opacities of logits, computed in float64 and rounded once."""
+    assert logits.dtype == np.float32
     alphas = np.empty_like(logits)
     kernels.call("sigmoid", logits.size, logits, alphas)
     return alphas

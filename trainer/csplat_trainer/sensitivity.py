@@ -122,11 +122,11 @@ def measure_sensitivity(
     """
     if not cameras:
         raise InputError("measuring sensitivity requires at least one camera")
-    drawing = _Derivatives(model, metric=metric, magnitudes=magnitudes, context=context)
+    derivatives = _Derivatives(model, metric=metric, magnitudes=magnitudes, context=context)
     for number, camera in enumerate(cameras):
-        drawing.add(camera, background)
+        derivatives.add(camera, background)
         context.progress("measuring sensitivity", (number + 1) / len(cameras))
-    return drawing.result()
+    return derivatives.result()
 
 
 class _Derivatives:

@@ -24,6 +24,7 @@ from csplat.portable_math import exp
 from csplat.types import F32, I64
 from csplat_render import Camera
 from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
+from csplat_render.metrics import squared_error
 from csplat_render.rasteriser import AdamStep, Rasteriser
 from csplat_trainer.fitter import COUNT_EVERY, Fitter
 from csplat_trainer.losses import LossValue
@@ -137,8 +138,12 @@ class _TrainingViews:
 
     def rms(self, splats: HasSplats) -> float:
         """Return the root mean square error over a sample of the views."""
-        sample = range(0, len(self), _SAMPLE)
-        errors = [np.mean(np.square(self._error_image(splats, view), dtype=np.float64)) for view in sample]
+        errors = []
+        for view in range(0, len(self), _SAMPLE):
+            render = self._rasteriser.forward(
+                splats, self._cameras[view], background=self._background, antialiased=self._antialiased
+            )
+            errors.append(np.mean(squared_error(self._references[view], render.rgb)))
         return math.sqrt(np.mean(errors))
 
     def gradients(self, splats: HasSplats, view: int) -> tuple[float, Gradients]:
@@ -156,14 +161,6 @@ class _TrainingViews:
             splats, self._cameras[view], reference, step, background=self._background, antialiased=self._antialiased
         )
         return error / max(1, reference.size)
-
-    def _error_image(self, splats: HasSplats, view: int) -> F32:
-        """Return the error of a view's render, [H, W, 3]; positive if it is too bright."""
-        render = self._rasteriser.forward(
-            splats, self._cameras[view], background=self._background, antialiased=self._antialiased
-        )
-        # Straight-through gradient of the clipping: a colour above 1 is reduced only if the reference is darker.
-        return np.clip(render.rgb, 0.0, 1.0) - np.clip(self._references[view], 0.0, 1.0)
 
 
 def _step_length(rms: float) -> float:
@@ -199,7 +196,7 @@ class _Refit:
         return LossValue(error, math.nan, math.nan, error)
 
     def after_step(self) -> None:
-        self._context.progress("adjusting splats", self._fitter.iteration / self._fitter.iterations)
+        self._context.progress("refitting splats", self._fitter.iteration / self._fitter.iterations)
 
     def _make_step(self, view: int, rates: dict[str, float]) -> float:
         """Make a step on a view, and return its mean squared error before."""

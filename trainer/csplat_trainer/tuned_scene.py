@@ -46,9 +46,10 @@ class TunedScene:
         self._tiles = _tile_table(fixed)
         self._sh_rows = None if book is None else CodebookRows.of(book.index, book.size)
         self._shape_rows = None if shapes is None else CodebookRows.of(shapes.index, shapes.size)
-        own, self._coarse = fixed.sh_coarseness(), np.zeros(len(shN), np.int32)
+        own, self._coarse = fixed.sh_coarseness(), np.zeros(shN.shape[:2], np.int32)
         if own is not None:
-            self._coarse[len(shN) - len(own) :] = own
+            self._coarse[len(shN) - len(own) :] = own[:, None]
+        self._kept_bits = None if fixed.zero is None else np.repeat(~fixed.zero[..., None], 3, axis=2) * ~np.uint32(0)
 
     @property
     def free_values(self) -> FreeValues:
@@ -74,7 +75,7 @@ class TunedScene:
         """Return decoded values; `None` if some are too large for the kernels, or not finite."""
         plan, tiles = self.fixed.parameters, self._tiles
         stored = StreamValues(*(np.empty_like(getattr(values, field.name)) for field in fields(StreamValues)))
-        means, (rows, width, _) = np.empty_like(values.means), values.sh.shape
+        means = np.empty_like(values.means)
         unusual = call(
             "dequantise_splats", len(means), len(tiles), tiles, plan.opacity_levels, plan.chroma_shift,
             values.means, values.opacities, values.sh0, means, stored.opacities, stored.sh0,
@@ -84,15 +85,16 @@ class TunedScene:
             "dequantise_shapes", len(values.quats), shared, len(shape_tiles), shape_tiles, plan.quat_levels,
             values.quats, values.scales, stored.quats, stored.scales,
         )  # fmt: skip
-        if width:
-            steps = plan.sh_step, plan.chroma_shift, self._coarse
-            unusual += call("dequantise_sh", rows, width, *steps, values.sh, stored.sh)
-        if unusual:
+        steps = plan.sh_step, plan.chroma_shift, self._coarse
+        if unusual + call("dequantise_sh", self._coarse.size, *steps, values.sh, stored.sh):
             return None
         quats, scales, shN = stored.quats, stored.scales, stored.sh
         if self._shape_rows is not None:
             quats, scales = self._shape_rows.take(quats), self._shape_rows.take(scales)
-            call("add_sizes", len(means), plan.scale_step, values.sizes, scales, stored.sizes)
+            step = np.float64(plan.scale_step)
+            sizes = np.rint(values.sizes / np.float32(step)) + np.float32(0.0)
+            stored.sizes[:] = sizes * step
+            scales[:] = (np.rint(scales / step) + sizes[:, None]) * step
         if self._sh_rows is not None:
             shN = self._sh_rows.take(shN)
         return DequantisedScene(means, quats, scales, stored.opacities, stored.sh0, shN, stored)
@@ -136,12 +138,13 @@ class TunedScene:
 
     def _constrain(self) -> None:
         """Restrict the values as `FixedQuantisation.constrain`."""
-        fixed, values = self.fixed, self.parameters.values
-        means, quats, sh, zero = values["means"], values["quats"], values["shN"], fixed.zero
-        boxes = fixed.low, fixed.high, means
-        call("constrain_values", len(means), *boxes, len(quats), quats, 0 if zero is None else zero.size, zero, sh)
+        means, quats, sh = (self.parameters.values[name] for name in ("means", "quats", "shN"))
+        np.clip(means, self.fixed.low, self.fixed.high, out=means)
+        quats[np.flatnonzero(quats[:, 0] < 0.0)] *= np.float32(-1.0)
+        if self._kept_bits is not None:
+            np.bitwise_and(sh.view(np.uint32), self._kept_bits, out=sh.view(np.uint32))  # faster than where=
         if self._shape_rows is not None:
-            values["sizes"][self._shape_rows.escaped] = 0.0
+            self.parameters.values["sizes"][self._shape_rows.escaped] = 0.0
 
 
 def _tile_table(fixed: FixedQuantisation) -> NDArray[np.float64]:
@@ -189,9 +192,7 @@ class CodebookRows:
 
     def take(self, rows: F32) -> F32:
         """Return the values [N, ...] of all splats, given those of the rows [R, ...]."""
-        out = np.empty((len(self.row), *rows.shape[1:]), np.float32)
-        call("take_rows", len(out), rows[0].size, self.row, rows, out)
-        return out
+        return np.take(rows, self.row, axis=0)
 
     def sum(self, values: F32) -> F32:
         """Return the sums of values [N, ...] over the splats of each row, [R, ...], in their order."""
@@ -314,8 +315,11 @@ class RateTerm:
             )
             _add_slopes(stored.scales[rows], grade.scale_step, per_bit, scales, steps["scales"][rows])
             _add_slopes(stored.quats[rows], grade.quat_step, per_bit, quats, steps["quats"][rows])
-            alphas, logits = stored.opacities[rows], steps["logits"][rows]
-            call("add_opacity_slopes", len(alphas), grade.levels, per_bit, opacities, alphas, logits)
+            # The level is levels √alpha, whose derivative by the logit is levels √alpha (1 − alpha) / 2.
+            alphas, root = stored.opacities[rows], np.sqrt(stored.opacities[rows])
+            levels = np.minimum(np.rint(root * np.float32(grade.levels)), MAX_INTEGER).astype(np.intp)
+            chain = np.float32(0.5 * grade.levels) * root * (np.float32(1.0) - alphas)
+            steps["logits"][rows] += np.float32(per_bit) * chain * opacities[0, MAX_INTEGER + levels]
             colours = stored.sh0[rows], steps["sh0"][rows]
             call("add_colour_slopes", len(alphas), 1, grade.sh0_step, shift, per_bit, sh0, *colours)
         _add_slopes(stored.sizes[:, None], plan.scale_step, per_bit, tables["sizes"], steps["sizes"][:, None])

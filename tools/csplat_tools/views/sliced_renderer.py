@@ -34,7 +34,7 @@ _BASE_BYTES = 320_000_000  # bytes of the program, samples, and buffered splats
 _BLOCKS = 16  # blocks of splats in memory: being decoded, or freed and not yet returned to the system
 _FOLDS = 2.2  # memory of a drawn splat divided by its arrays; it exists as a record and in arrays
 _SPLAT_BYTES = 300  # additional bytes of the rasteriser per splat
-_PAIR_BYTES = 5  # bytes per pair of a splat and a tile that it touches
+_PAIR_BYTES = 12  # bytes per pair of a splat and a tile that it touches
 _FULL = 0.75  # planned fraction of a slice's memory, since its limits come from a sample
 _READING = 0.6  # fraction of the time of a render that reading takes, for progress
 

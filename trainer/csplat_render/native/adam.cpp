@@ -3,6 +3,7 @@
 
 #include "library.h"
 #include "threads.h"
+#include "vectors.h"
 
 using namespace csplat;
 
@@ -28,15 +29,13 @@ CSPLAT_API int64_t csplat_constrain_splats(int64_t threads, int64_t rows, float*
 // Computes alpha = 1 / (1 + e^−logit) of n logits in double, rounded once.
 CSPLAT_API int64_t csplat_sigmoid(int64_t threads, int64_t n, const float* logits, float* alphas) {
   parallel_runs(threads, n, 1 << 13, [=](int64_t begin, int64_t end, int) {
-    const auto compute = [](const float* from, float* to) {
-      const Doubles x = smaller(all(700.0), larger(all(-700.0), load_doubles(from)));
-      store_floats(to, all(1.0) / (all(1.0) + exp(-x)));
+    const auto compute = [](Doubles x) {
+      return all(1.0) / (all(1.0) + exp(-smaller(all(700.0), larger(all(-700.0), x))));
     };
-    for (; begin + kDoubles <= end; begin += kDoubles) compute(logits + begin, alphas + begin);
-    float lanes[kDoubles] = {};
-    std::memcpy(lanes, logits + begin, static_cast<size_t>(end - begin) * sizeof(float));
-    compute(lanes, lanes);
-    std::memcpy(alphas + begin, lanes, static_cast<size_t>(end - begin) * sizeof(float));
+    for (; begin + kDoubles <= end; begin += kDoubles)
+      store_floats(alphas + begin, compute(load_doubles(logits + begin)));
+    for (; begin < end; begin++)
+      alphas[begin] = static_cast<float>(first_lane(compute(all(static_cast<double>(logits[begin])))));
   });
   return 0;
 }

@@ -10,38 +10,21 @@
 
 #include <cmath>
 #include <cstdint>
-#include <cstring>
-
-#include "vectors.h"
 
 namespace csplat {
 
 // Makes a step for `count` values.
 inline void step_adam(float rate, float over_root, float b2, int64_t count, float* value, const float* gradient,
                       float* first, float* second) {
-  const auto step = [=](float* p, const float* g, float* m, float* v) {
-    const Floats slope = load(g), tiny = all(1e-30f);
-    Floats mean = fma(all(0.9f), load(m), all(0.1f) * slope);
-    Floats square = fma(all(b2), load(v), all(1.0f - b2) * slope * slope);
-    mean = keep(at_least(magnitude(mean), tiny), mean);
-    square = keep(at_least(square, tiny), square);
-    store(m, mean);
-    store(v, square);
-    store(p, load(p) - all(rate) * mean / fma(square_root(square), all(over_root), all(1e-15f)));
-  };
-  int64_t n = 0;
-  for (; n + kFloats <= count; n += kFloats) step(value + n, gradient + n, first + n, second + n);
-  const size_t left = static_cast<size_t>(count - n) * sizeof(float);
-  if (!left) return;
-  float p[kFloats] = {}, g[kFloats] = {}, m[kFloats] = {}, v[kFloats] = {};
-  std::memcpy(p, value + n, left);
-  std::memcpy(g, gradient + n, left);
-  std::memcpy(m, first + n, left);
-  std::memcpy(v, second + n, left);
-  step(p, g, m, v);
-  std::memcpy(value + n, p, left);
-  std::memcpy(first + n, m, left);
-  std::memcpy(second + n, v, left);
+  for (int64_t n = 0; n < count; n++) {
+    float mean = std::fma(0.9f, first[n], 0.1f * gradient[n]);
+    float square = std::fma(b2, second[n], (1.0f - b2) * gradient[n] * gradient[n]);
+    mean = std::fabs(mean) >= 1e-30f ? mean : 0.0f;
+    square = square >= 1e-30f ? square : 0.0f;
+    first[n] = mean;
+    second[n] = square;
+    value[n] -= rate * mean / std::fma(std::sqrt(square), over_root, 1e-15f);
+  }
 }
 
 // Normalises quaternions w x y z, [count, 4]; those that are shorter than 1e-12 or NaN become the identity.

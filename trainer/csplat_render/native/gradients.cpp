@@ -457,7 +457,6 @@ CSPLAT_API int64_t csplat_step(int64_t threads, Renderer* renderer, const Splats
     const float over_root = static_cast<float>(step->over_root), beta2 = static_cast<float>(step->beta2);
     for_each_block(threads, splats->blocks(), [&](int64_t block) {
       const int64_t first = block * kBlock, count = std::min<int64_t>(kBlock, splats->count - first);
-      if (step->means2d) std::fill(step->means2d + first, step->means2d + first + count, 0.0f);
       BlockGradients g;
       if (renderer->drawn[block])
         block_gradients(*renderer, *splats, *view, block, step->groups[0].values, g);

@@ -12,10 +12,11 @@
 //
 // The window is separable. A thread goes down a band of rows: it blurs across 11 rows of the images, then along the
 // result, and keeps the derivatives of 11 rows, blurred along. The size of bands depends on the number of threads, the
-// values of a row do not. Loops are vectorised over the values of a row, three per pixel.
+// values of a row do not. Loops are vectorised over the values of a row, three per pixel. Images of doubles have no
+// gradient.
 #include <algorithm>
 #include <cmath>
-#include <utility>
+#include <type_traits>
 #include <vector>
 
 #include "library.h"
@@ -34,12 +35,10 @@ using Vector = decltype(load(static_cast<const T*>(nullptr)));
 template <typename T>
 constexpr int kLanes = sizeof(Vector<T>) / sizeof(T);
 
-// A sum along a row, in double: of 16 lanes first.
+// A sum along a row: of 16 lanes first, then in double.
 template <typename T>
 struct RowSum {
-  Vector<T> parts[kBlock / kLanes<T>];
-
-  RowSum() { std::fill(std::begin(parts), std::end(parts), all(T(0))); }
+  Vector<T> parts[kBlock / kLanes<T>] = {};
 
   double total() const {
     T lanes[kBlock];
@@ -68,185 +67,193 @@ struct Window {
     for (int k = 0; k <= kRadius; k++) taps[k] = all(static_cast<T>(weights[k] / total));
   }
 
-  // Returns the blurred values of a row at p.
-  Vector<T> along(const T* p) const {
-    Vector<T> sum = taps[0] * load(p);
-    for (int k = 1; k <= kRadius; k++) sum = fma(taps[k], load(p - kPixel * k) + load(p + kPixel * k), sum);
+  // Returns the sum of weights times at(−5) to at(5).
+  template <typename At>
+  Vector<T> mean(At&& at) const {
+    Vector<T> sum = taps[0] * at(0);
+    for (int k = 1; k <= kRadius; k++) sum = fma(taps[k], at(-k) + at(k), sum);
     return sum;
   }
 
-  // Returns the blurred values of 11 rows at i.
+  // Returns the blurred values of a row at p, and of a ring of rows at i.
+  Vector<T> along(const T* p) const { return mean([p](int k) { return load(p + kPixel * k); }); }
   Vector<T> across(const T* const* rows, int64_t i) const {
-    Vector<T> sum = taps[0] * load(rows[kRadius] + i);
-    for (int k = 1; k <= kRadius; k++)
-      sum = fma(taps[k], load(rows[kRadius - k] + i) + load(rows[kRadius + k] + i), sum);
-    return sum;
+    return mean([=](int k) { return load(rows[kRadius + k] + i); });
   }
 };
 
-// Two images with `width` values per row.
+// Two images with `width` values per row, and what is computed of them.
 template <typename T>
-struct Images {
+struct Comparison {
   const T *x, *y;
   int64_t height, width;
+  T l1_step, ssim_step;
+  T* gradient;
+  double* sums;  // of |x − y|, SSIM and (x − y)², [3] per row
 };
 
 // The rows that a thread works on: aligned, filled up with zeros to full blocks, with a margin of zeros on either side.
 template <typename T>
-class Workspace {
+class Band {
  public:
-  // Numbers of rows: 1 inside the image; E[x], E[y], E[x² + y²], E[x y] across rows; derivatives by E[x], E[x²] (twice)
-  // and E[x y]; the gradient. Rings of 11 rows: x, y, and the derivatives blurred along.
-  enum Row {
-    kInside, kMoments, kDerivatives = kMoments + 4, kGradient = kDerivatives + 3, kX, kY = kX + kWindow,
-    kAlong = kY + kWindow, kMetricRows = kAlong, kRows = kAlong + 3 * kWindow,
-  };
-
-  void allocate(int64_t width, int rows) {
-    stride_ = (width + kBlock - 1) / kBlock * kBlock + 2 * kBlock;
-    values_.assign(rows * stride_ + kBlock, T(0));
+  explicit Band(const Comparison<T>& job) : job_(job) {
+    const int64_t stride = (job.width + kBlock - 1) / kBlock * kBlock + 2 * kBlock;
+    values_.assign(kRows * stride + kBlock, T(0));
     const auto place = reinterpret_cast<uintptr_t>(values_.data());
-    first_ = values_.data() + (-place % (kBlock * sizeof(T))) / sizeof(T) + kBlock;
-    std::fill_n(row(kInside), width, T(1));
+    T* next = values_.data() + (-place % (kBlock * sizeof(T))) / sizeof(T) + kBlock;
+    for (T*& row : rows_) row = next, next += stride;
+    std::fill_n(rows_[kInside], job.width, T(1));
   }
 
-  T* row(int number) const { return first_ + number * stride_; }
-
-  // Returns row r of a ring of 11 rows.
-  T* row(int ring, int64_t r) const { return row(ring + static_cast<int>((r + kWindow) % kWindow)); }
-
-  // Copies row r of the images to the rings, or zeros.
-  void read(const Images<T>& images, int64_t r) const {
-    for (const auto& [ring, image] : {std::pair(kX, images.x), std::pair(kY, images.y)})
-      if (r >= 0 && r < images.height)
-        std::copy_n(image + r * images.width, images.width, row(ring, r));
-      else
-        std::fill_n(row(ring, r), images.width, T(0));
+  // Computes the rows `begin` to `end`.
+  void compute(int64_t begin, int64_t end) {
+    const Window<T> window;
+    const int64_t width = job_.width, radius = job_.ssim_step != T(0) ? kRadius : 0;
+    const int64_t margin = kHasGradient ? radius : 0;  // rows whose derivatives are needed
+    for (int64_t s = begin - radius - margin; s < end + radius + margin; s++) {  // a row that is read
+      read(job_.x, s, rows_ + kX);
+      read(job_.y, s, rows_ + kY);
+      const int64_t r = s - radius;  // a row that is compared
+      if (r < begin - margin) continue;
+      if (radius) {
+        const bool is_inside = r >= 0 && r < job_.height;
+        const double ssim = is_inside ? compare(window) : 0.0;
+        if (r >= begin && r < end) job_.sums[3 * r + 1] = ssim;
+        for (int ring = kAlong; kHasGradient && ring < kRows; ring += kWindow) {
+          T *const to = turn(rows_ + ring), *const from = rows_[kDerivatives + (ring - kAlong) / kWindow];
+          if (is_inside)
+            for_vectors<T>(width, [&](int64_t i, int) { store(to + i, window.along(from + i)); });
+          else
+            std::fill_n(to, width, T(0));
+        }
+      }
+      if constexpr (kHasGradient)
+        if (r - margin >= begin) finish(window, r - margin);
+    }
   }
 
  private:
-  std::vector<T> values_;
-  T* first_ = nullptr;
-  int64_t stride_ = 0;
-};
+  static constexpr bool kHasGradient = std::is_same_v<T, float>;
 
-// Returns the sum of SSIM of row r, from rows of the rings; computes the derivatives, too, if `kGradient`.
-template <bool kGradient, typename T>
-double compare_row(int64_t r, int64_t width, const Window<T>& window, const Workspace<T>& space) {
-  using V = Vector<T>;
-  using S = Workspace<T>;
-  const T *x[kWindow], *y[kWindow];
-  for (int k = 0; k < kWindow; k++) x[k] = space.row(S::kX, r + k - kRadius), y[k] = space.row(S::kY, r + k - kRadius);
-  T *moments[4], *derivatives[3];
-  for (int k = 0; k < 4; k++) moments[k] = space.row(S::kMoments + k);
-  for (int k = 0; k < 3; k++) derivatives[k] = space.row(S::kDerivatives + k);
-  const T* const inside = space.row(S::kInside);
-  const V* const taps = window.taps;
-  for_vectors<T>(width, [&](int64_t i, int) {
-    const V u = load(x[kRadius] + i), v = load(y[kRadius] + i);
-    V mean_x = taps[0] * u, mean_y = taps[0] * v, square = taps[0] * fma(u, u, v * v), product = mean_x * v;
-    for (int k = 1; k <= kRadius; k++) {
-      const V u0 = load(x[kRadius - k] + i), v0 = load(y[kRadius - k] + i);
-      const V u1 = load(x[kRadius + k] + i), v1 = load(y[kRadius + k] + i);
-      mean_x = fma(taps[k], u0 + u1, mean_x);
-      mean_y = fma(taps[k], v0 + v1, mean_y);
-      square = fma(taps[k], fma(u0, u0, fma(v0, v0, fma(u1, u1, v1 * v1))), square);
-      product = fma(taps[k], fma(u0, v0, u1 * v1), product);
-    }
-    store(moments[0] + i, mean_x), store(moments[1] + i, mean_y);
-    store(moments[2] + i, square), store(moments[3] + i, product);
-  });
-  RowSum<T> sum;
-  const V c1 = all(T(0.01 * 0.01)), c2 = all(T(0.03 * 0.03)), two = all(T(2));
-  for_vectors<T>(width, [&](int64_t i, int part) {
-    const V m1 = window.along(moments[0] + i), m2 = window.along(moments[1] + i), mm = m1 * m2;
-    const V n = fma(m1, m1, m2 * m2), square = window.along(moments[2] + i), product = window.along(moments[3] + i);
-    const V a = fma(two, mm, c1), b = fma(two, product - mm, c2), c = n + c1, d = square - n + c2;
-    const V over = load(inside + i) / (c * d), ssim = a * b * over;  // 0 beyond the end of the row
-    sum.parts[part] = sum.parts[part] + ssim;
-    if (!kGradient) return;
-    const V by_square = -ssim * (c * over), by_product = two * a * over;
-    store(derivatives[0] + i, two * (m2 * b * over - m1 * fma(ssim, d * over, by_square)) - m2 * by_product);
-    store(derivatives[1] + i, two * by_square);
-    store(derivatives[2] + i, by_product);
-  });
-  return sum.total();
-}
+  // Rows: 1 inside the image; E[x], E[y], E[x² + y²], E[x y] across rows; derivatives by E[x], E[x²] (twice) and
+  // E[x y]; the gradient. Rings of the last 11 rows: x, y, and the derivatives blurred along.
+  enum Row {
+    kInside, kMoments, kDerivatives = kMoments + 4, kGradient = kDerivatives + 3, kX, kY = kX + kWindow,
+    kAlong = kY + kWindow, kRows = kAlong + 3 * kWindow,
+  };
 
-// Writes the rows `begin` to `end` of the gradient, and their sums of |x − y|, SSIM and (x − y)², [3] per row.
-void gradient_of_band(const Images<float>& images, int64_t begin, int64_t end, float l1_step, float ssim_step,
-                      const Workspace<float>& space, float* gradient, double* sums) {
-  using S = Workspace<float>;
-  const Window<float> window;
-  const int64_t width = images.width, radius = ssim_step != 0.0f ? kRadius : 0;
-  for (int64_t s = begin - 2 * radius; s < end + 2 * radius; s++) {  // a row that is read
-    space.read(images, s);
-    const int64_t r = s - radius, q = r - radius;  // a row that is compared, a row that is finished
-    if (r < begin - radius) continue;
-    if (radius) {
-      const bool is_inside = r >= 0 && r < images.height;
-      const double ssim = is_inside ? compare_row<true>(r, width, window, space) : 0.0;
-      if (r >= begin && r < end) sums[3 * r + 1] = ssim;
-      for (int field = 0; field < 3; field++) {
-        float* const along = space.row(S::kAlong + field * kWindow, r);
-        const float* const in = space.row(S::kDerivatives + field);
-        if (is_inside)
-          for_vectors<float>(width, [&](int64_t i, int) { store(along + i, window.along(in + i)); });
-        else
-          std::fill_n(along, width, 0.0f);
+  // Makes place for a row at the end of a ring, and returns it.
+  static T* turn(T** ring) {
+    std::rotate(ring, ring + 1, ring + kWindow);
+    return ring[kWindow - 1];
+  }
+
+  void read(const T* image, int64_t r, T** ring) {
+    if (r >= 0 && r < job_.height)
+      std::copy_n(image + r * job_.width, job_.width, turn(ring));
+    else
+      std::fill_n(turn(ring), job_.width, T(0));
+  }
+
+  // Returns the sum of SSIM of the rings' middle row, and computes the derivatives.
+  double compare(const Window<T>& window) const {
+    using V = Vector<T>;
+    const V* const taps = window.taps;
+    const T *const *x = rows_ + kX + kRadius, *const *y = rows_ + kY + kRadius, *inside = rows_[kInside];
+    T *moments[4], *derivatives[3];
+    std::copy_n(rows_ + kMoments, 4, moments);
+    std::copy_n(rows_ + kDerivatives, 3, derivatives);
+    for_vectors<T>(job_.width, [&](int64_t i, int) {
+      const V u = load(x[0] + i), v = load(y[0] + i);
+      V mean_x = taps[0] * u, mean_y = taps[0] * v, square = taps[0] * fma(u, u, v * v), product = mean_x * v;
+      for (int k = 1; k <= kRadius; k++) {
+        const V u0 = load(x[-k] + i), v0 = load(y[-k] + i), u1 = load(x[k] + i), v1 = load(y[k] + i);
+        mean_x = fma(taps[k], u0 + u1, mean_x);
+        mean_y = fma(taps[k], v0 + v1, mean_y);
+        square = fma(taps[k], fma(u0, u0, fma(v0, v0, fma(u1, u1, v1 * v1))), square);
+        product = fma(taps[k], fma(u0, v0, u1 * v1), product);
       }
-    }
-    if (q < begin) continue;
-    const float* rows[3][kWindow];
-    for (int field = 0; field < 3; field++)
-      for (int k = 0; k < kWindow; k++) rows[field][k] = space.row(S::kAlong + field * kWindow, q + k - kRadius);
-    const float *const x = space.row(S::kX, q), *const y = space.row(S::kY, q);
-    float* const out = space.row(S::kGradient);
+      store(moments[0] + i, mean_x), store(moments[1] + i, mean_y);
+      store(moments[2] + i, square), store(moments[3] + i, product);
+    });
+    RowSum<T> sum;
+    const V c1 = all(T(0.01 * 0.01)), c2 = all(T(0.03 * 0.03)), two = all(T(2));
+    for_vectors<T>(job_.width, [&](int64_t i, int part) {
+      const V m1 = window.along(moments[0] + i), m2 = window.along(moments[1] + i);
+      const V mm = m1 * m2, n = fma(m1, m1, m2 * m2);
+      const V a = fma(two, mm, c1), b = fma(two, window.along(moments[3] + i) - mm, c2);
+      const V c = n + c1, d = window.along(moments[2] + i) - n + c2;
+      const V over = load(inside + i) / (c * d), ssim = a * b * over;  // 0 beyond the end of the row
+      sum.parts[part] = sum.parts[part] + ssim;
+      if (!kHasGradient) return;
+      const V by_square = -ssim * (c * over), by_product = two * a * over;
+      store(derivatives[0] + i, two * (m2 * b * over - m1 * fma(ssim, d * over, by_square)) - m2 * by_product);
+      store(derivatives[1] + i, two * by_square);
+      store(derivatives[2] + i, by_product);
+    });
+    return sum.total();
+  }
+
+  // Writes row q of the gradient, and its sums.
+  void finish(const Window<float>& window, int64_t q) const {
+    const bool has_ssim = job_.ssim_step != 0.0f;
+    const int place = has_ssim ? 0 : kWindow - 1;  // of row q in the rings
+    const float *x = rows_[kX + place], *y = rows_[kY + place];
+    const Floats l1_step = all(job_.l1_step), ssim_step = all(job_.ssim_step);
+    float* const out = rows_[kGradient];
     RowSum<float> l1, square;
-    for_vectors<float>(width, [&](int64_t i, int part) {
+    for_vectors<float>(job_.width, [&](int64_t i, int part) {
       const Floats u = load(x + i), v = load(y + i), difference = u - v;
-      Floats step = sign_of(difference, all(l1_step));
-      if (radius) {
-        const Floats sum = fma(u, window.across(rows[1], i), window.across(rows[0], i));
-        step = fma(all(ssim_step), fma(v, window.across(rows[2], i), sum), step);
+      Floats step = sign_of(difference, l1_step);
+      if (has_ssim) {
+        const Floats by_x = window.across(rows_ + kAlong, i), by_square = window.across(rows_ + kAlong + kWindow, i);
+        const Floats by_product = window.across(rows_ + kAlong + 2 * kWindow, i);
+        step = fma(ssim_step, fma(v, by_product, fma(u, by_square, by_x)), step);
       }
       l1.parts[part] = l1.parts[part] + magnitude(difference);
       square.parts[part] = fma(difference, difference, square.parts[part]);
       store(out + i, step);
     });
-    sums[3 * q] = l1.total();
-    sums[3 * q + 2] = square.total();
-    std::copy_n(out, width, gradient + q * width);
+    job_.sums[3 * q] = l1.total();
+    job_.sums[3 * q + 2] = square.total();
+    std::copy_n(out, job_.width, job_.gradient + q * job_.width);
   }
-}
 
-// Calls work(begin, end, workspace, sums) for bands of rows; adds up sums [height, count] of the rows into `totals`.
-template <typename T, typename Work>
-void for_bands(int64_t threads, const Images<T>& images, int rows, int count, double* totals, Work&& work) {
-  const int64_t runs = threads > 1 ? 2 * threads : 1;
-  const int64_t band = std::max<int64_t>((images.height + runs - 1) / runs, kMinBand);
-  std::vector<Workspace<T>> spaces(std::min(threads, (images.height + band - 1) / band));
-  for (Workspace<T>& space : spaces) space.allocate(images.width, rows);
-  std::vector<double> sums(images.height * count);
-  parallel_runs(threads, images.height, band, [&](int64_t begin, int64_t end, int thread) {
-    work(begin, end, spaces[thread], sums.data());
-  });
-  std::fill_n(totals, count, 0.0);
-  for (int64_t r = 0; r < images.height; r++)
-    for (int k = 0; k < count; k++) totals[k] += sums[r * count + k];
-}
-
-// The convolution: pixels of a row × outputs that are summed in registers.
-constexpr int kPanel = 2 * kFloats, kTile = kFloats == 16 ? 12 : 6;
-
-struct Convolution {
-  int64_t values, across;  // of the image: values per row, and per pixel of the result
-  int64_t height, taps;    // of the kernel: rows, and adjacent values per row
+  const Comparison<T> job_;
+  std::vector<T> values_;
+  T* rows_[kRows];
 };
 
-// Computes kPixels × kPanel results: sums of products in the order of the kernel's rows and values.
+// Computes bands of rows, and adds up the sums, [3].
+template <typename T>
+int64_t compare_images(int64_t threads, Comparison<T> job, double* sums) {
+  return guarded([&]() -> int64_t {
+    const int64_t runs = threads > 1 ? 2 * threads : 1;
+    const int64_t size = std::max<int64_t>((job.height + runs - 1) / runs, kMinBand);
+    std::vector<double> row_sums(3 * job.height);
+    job.sums = row_sums.data();
+    parallel_runs(threads, job.height, size,
+                  [&](int64_t begin, int64_t end, int) { Band<T>(job).compute(begin, end); });
+    std::fill_n(sums, 3, 0.0);
+    for (size_t k = 0; k < row_sums.size(); k++) sums[k % 3] += row_sums[k];
+    return 0;
+  });
+}
+
+// The convolution: pixels of a row × outputs that are summed in registers, and outputs of a panel of weights.
+constexpr int kTile = kFloats == 16 ? 12 : 6, kAcross = 2 * kFloats, kPanel = 32;
+
+struct Convolution {
+  int64_t values, across;          // of the image: values per row, and per pixel of the result
+  int64_t height, taps, outputs;   // of the kernel: rows, adjacent values per row, and outputs
+};
+
+// Computes `pixels` <= kPixels × kAcross results: sums of products in the order of the kernel's rows and values.
 template <int kPixels>
-void convolve_tile(const Convolution& job, const float* x, const float* weights, const float* bias, float* out) {
+void convolve_tile(const Convolution& job, int64_t pixels, const float* x, const float* weights, const float* bias,
+                   float* out) {
+  if constexpr (kPixels > 1)
+    if (pixels < kPixels) return convolve_tile<kPixels - 1>(job, pixels, x, weights, bias, out);
   Floats sums[kPixels][2];
   for (int p = 0; p < kPixels; p++) sums[p][0] = load(bias), sums[p][1] = load(bias + kFloats);
   for (int64_t i = 0; i < job.height; i++, x += job.values)
@@ -258,15 +265,7 @@ void convolve_tile(const Convolution& job, const float* x, const float* weights,
         sums[p][1] = fma(value, w1, sums[p][1]);
       }
     }
-  for (int p = 0; p < kPixels; p++) store(out + p * kPanel, sums[p][0]), store(out + p * kPanel + kFloats, sums[p][1]);
-}
-
-using Tile = void (*)(const Convolution&, const float*, const float*, const float*, float*);
-
-template <int... kPixels>
-Tile tile_of(int64_t pixels, std::integer_sequence<int, kPixels...>) {
-  static constexpr Tile tiles[] = {convolve_tile<kPixels + 1>...};
-  return tiles[pixels - 1];
+  for (int p = 0; p < kPixels; p++, out += job.outputs) store(out, sums[p][0]), store(out + kFloats, sums[p][1]);
 }
 
 }  // namespace
@@ -278,67 +277,35 @@ Tile tile_of(int64_t pixels, std::integer_sequence<int, kPixels...>) {
 CSPLAT_API int64_t csplat_photometric_loss(int64_t threads, const float* x, const float* y, int64_t height,
                                            int64_t width, double l1_step, double ssim_step, float* gradient,
                                            double* sums) {
-  return guarded([&]() -> int64_t {
-    const Images<float> images{x, y, height, width};
-    for_bands(threads, images, Workspace<float>::kRows, 3, sums,
-              [&](int64_t begin, int64_t end, const Workspace<float>& space, double* row_sums) {
-                gradient_of_band(images, begin, end, static_cast<float>(l1_step), static_cast<float>(ssim_step), space,
-                                 gradient, row_sums);
-              });
-    return 0;
-  });
+  const float steps[2] = {static_cast<float>(l1_step), static_cast<float>(ssim_step)};
+  return compare_images<float>(threads, {x, y, height, width, steps[0], steps[1], gradient, nullptr}, sums);
 }
 
-// Sums SSIM of two images, [height, width] float64, into `sum`, [1].
+// Sums SSIM of two images, [height, width] float64, into the second of `sums`, [3].
 CSPLAT_API int64_t csplat_ssim(int64_t threads, const double* x, const double* y, int64_t height, int64_t width,
-                               double* sum) {
-  return guarded([&]() -> int64_t {
-    const Images<double> images{x, y, height, width};
-    const Window<double> window;
-    for_bands(threads, images, Workspace<double>::kMetricRows, 1, sum,
-              [&](int64_t begin, int64_t end, const Workspace<double>& space, double* row_sums) {
-                for (int64_t s = begin - kRadius; s < end + kRadius; s++) {
-                  space.read(images, s);
-                  const int64_t r = s - kRadius;
-                  if (r >= begin) row_sums[r] = compare_row<false>(r, width, window, space);
-                }
-              });
-    return 0;
-  });
+                               double* sums) {
+  return compare_images<double>(threads, {x, y, height, width, 0.0, 1.0, nullptr, nullptr}, sums);
 }
 
 // Convolves an image: result[r, c, o] = bias[o] + Σ_ik weights[i, k, o] · x[r down + i, c across + k].
 //
-// x: [rows of the image, values]; weights: [height, taps, outputs]; result: [rows, columns, outputs]; all float32.
+// x: [rows of the image, values]; weights: [outputs / 32, height, taps, 32]; bias: [outputs]; result: [rows, columns,
+// outputs]; all float32. The number of outputs is a multiple of 32.
 CSPLAT_API int64_t csplat_convolve(int64_t threads, const float* x, int64_t values, const float* weights,
                                    const float* bias, int64_t height, int64_t taps, int64_t outputs, int64_t down,
                                    int64_t across, int64_t rows, int64_t columns, float* result) {
-  return guarded([&]() -> int64_t {
-    const Convolution job{values, across, height, taps};
-    const int64_t panels = (outputs + kPanel - 1) / kPanel, all_taps = height * taps;
-    std::vector<float> packed(panels * (all_taps + 1) * kPanel);  // per panel of outputs: their bias, and their weights
-    parallel(threads, panels, [&](int64_t panel, int) {
-      const int64_t first = panel * kPanel, count = std::min<int64_t>(kPanel, outputs - first);
-      float* out = packed.data() + panel * (all_taps + 1) * kPanel;
-      std::copy_n(bias + first, count, out);
-      for (int64_t k = 0; k < all_taps; k++) std::copy_n(weights + k * outputs + first, count, out += kPanel);
-    });
-    const int64_t tiles = (columns + kTile - 1) / kTile;
-    parallel(threads, panels * rows, [&](int64_t item, int) {
-      const int64_t panel = item / rows, r = item % rows, first = panel * kPanel;
-      const int64_t count = std::min<int64_t>(kPanel, outputs - first);
-      const float* const own = packed.data() + panel * (all_taps + 1) * kPanel;
-      for (int64_t tile = 0; tile < tiles; tile++) {
-        const int64_t begin = tile * columns / tiles, pixels = (tile + 1) * columns / tiles - begin;
-        float out[kTile * kPanel];
-        tile_of(pixels, std::make_integer_sequence<int, kTile>())(
-            job, x + r * down * values + begin * across, own + kPanel, own, out);
-        for (int64_t p = 0; p < pixels; p++)
-          std::copy_n(out + p * kPanel, count, result + (r * columns + begin + p) * outputs + first);
-      }
-    });
-    return 0;
+  const Convolution job{values, across, height, taps, outputs};
+  const int64_t tiles = (columns + kTile - 1) / kTile;
+  parallel(threads, outputs / kAcross * rows, [&](int64_t item, int) {
+    const int64_t first = item / rows * kAcross, r = item % rows;
+    const float* own = weights + first / kPanel * kPanel * height * taps + first % kPanel;
+    for (int64_t tile = 0; tile < tiles; tile++) {
+      const int64_t begin = tile * columns / tiles, pixels = (tile + 1) * columns / tiles - begin;
+      convolve_tile<kTile>(job, pixels, x + r * down * values + begin * across, own, bias + first,
+                           result + (r * columns + begin) * outputs + first);
+    }
   });
+  return 0;
 }
 
 }  // namespace csplat

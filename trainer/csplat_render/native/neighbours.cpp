@@ -82,11 +82,7 @@ struct Tree {
 struct Search {
   const Tree& tree;
   double at[4];
-  int64_t wanted;
-  double* squared;
-  int64_t* ranks;
-
-  Candidate last() const { return {squared[wanted - 1], ranks[wanted - 1]}; }
+  Candidate *found, *last;  // the candidates, in order
 
   Candidate least(int64_t level, int64_t node) const {
     const Box& box = tree.box(level, node);
@@ -101,58 +97,46 @@ struct Search {
     if (level == tree.depth) return scan(node);
     int64_t nearer = 2 * node;
     Candidate near = least(level + 1, nearer), far = least(level + 1, nearer + 1);
-    if (far < near) {
-      std::swap(near, far);
-      nearer++;
-    }
-    if (near < last()) visit(level + 1, nearer);
-    if (far < last()) visit(level + 1, nearer ^ 1);
+    if (far < near) std::swap(near, far), nearer++;
+    if (near < *last) visit(level + 1, nearer);
+    if (far < *last) visit(level + 1, nearer ^ 1);
   }
 
-  void scan(int64_t leaf) {
+  void scan(int64_t leaf) const {
     const int64_t begin = tree.begin(tree.depth, leaf), count = tree.begin(tree.depth, leaf + 1) - begin;
     const double *x = tree.points + 4 * begin, *y = x + count, *z = y + count, *rows = z + count;
-    double found[kLeaf];
+    double squared[kLeaf];
     for (int64_t n = 0; n < count; n++) {
       const double a = x[n] - at[0], b = y[n] - at[1], c = z[n] - at[2];
-      found[n] = a * a + b * b + c * c;
+      squared[n] = a * a + b * b + c * c;
     }
     for (int64_t n = 0; n < count; n++)
-      if (found[n] <= squared[wanted - 1] && rows[n] != at[3]) {
+      if (squared[n] <= last->squared && rows[n] != at[3]) {
         const int64_t apart = static_cast<int64_t>(rows[n] - at[3]);
-        add({found[n], apart > 0 ? 2 * apart + 1 : -2 * apart});
+        const Candidate candidate{squared[n], apart > 0 ? 2 * apart + 1 : -2 * apart};
+        if (!(candidate < *last)) continue;
+        Candidate* place = last;
+        for (; place > found && candidate < place[-1]; place--) *place = place[-1];
+        *place = candidate;
       }
-  }
-
-  void add(Candidate candidate) {
-    if (!(candidate < last())) return;
-    int64_t place = wanted - 1;
-    for (; place > 0 && candidate < Candidate{squared[place - 1], ranks[place - 1]}; place--) {
-      squared[place] = squared[place - 1];
-      ranks[place] = ranks[place - 1];
-    }
-    squared[place] = candidate.squared;
-    ranks[place] = candidate.rank;
   }
 };
 
 void search(const Tree& tree, int64_t threads, int64_t wanted, int64_t* neighbours, double* distances) {
-  constexpr int64_t kNone = std::numeric_limits<int64_t>::max();
+  const Candidate none{std::numeric_limits<double>::infinity(), std::numeric_limits<int64_t>::max()};
   parallel_runs(threads, int64_t(1) << tree.depth, kRun, [&](int64_t first, int64_t last, int) {
+    std::vector<Candidate> found(wanted);
     for (int64_t leaf = first; leaf < last; leaf++) {
       const int64_t begin = tree.begin(tree.depth, leaf), count = tree.begin(tree.depth, leaf + 1) - begin;
       for (int64_t n = 0; n < count; n++) {
         const double* from = tree.points + 4 * begin + n;
+        std::fill(found.begin(), found.end(), none);
+        Search{tree, {from[0], from[count], from[2 * count], from[3 * count]}, found.data(), &found.back()}.visit(0, 0);
         const int64_t row = static_cast<int64_t>(from[3 * count]);
-        Search search{tree, {from[0], from[count], from[2 * count], from[3 * count]}, wanted,
-                      distances + row * wanted, neighbours + row * wanted};
-        std::fill_n(search.squared, wanted, std::numeric_limits<double>::infinity());
-        std::fill_n(search.ranks, wanted, kNone);
-        search.visit(0, 0);
         for (int64_t k = 0; k < wanted; k++) {
-          const int64_t rank = search.ranks[k];
-          search.ranks[k] = rank == kNone ? -1 : row + (rank & 1 ? rank / 2 : -(rank / 2));
-          search.squared[k] = std::sqrt(search.squared[k]);
+          const int64_t rank = found[k].rank, apart = rank & 1 ? rank / 2 : -(rank / 2);
+          neighbours[row * wanted + k] = rank == none.rank ? -1 : row + apart;
+          distances[row * wanted + k] = std::sqrt(found[k].squared);
         }
       }
     }

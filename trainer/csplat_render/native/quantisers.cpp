@@ -19,7 +19,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <cstring>
 #include <type_traits>
 
 #include "library.h"
@@ -84,18 +83,16 @@ bool round_quats(int64_t n, double levels, double multiple, const float* quats, 
   const double over = 1.0 / (levels * kRoot2), squared = 2.0 * levels * levels;
   int outside = 0;
   for (int64_t i = 0; i < n; i++, quats += 4, out += 4) {
-    double q[3], sum = 0.0;
+    double q[3];
+    const auto length = [&]() { return (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) * multiple * multiple; };
     for (int c = 0; c < 3; c++) {
       const float scaled = quats[c + 1] * factor, whole = std::rint(scaled);
       outside |= !(std::fabs(scaled) < 1e9f);
       q[c] = whole < -most ? -most : whole > most ? most : whole;
     }
-    sum = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) * multiple * multiple;
-    if (sum > squared) {
+    if (length() > squared)
       for (int c = 0; c < 3; c++) q[c] = std::trunc(quats[c + 1] * factor);
-      sum = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) * multiple * multiple;
-    }
-    out[0] = static_cast<float>(std::sqrt(squared - sum) * over);
+    out[0] = static_cast<float>(std::sqrt(squared - length()) * over);
     for (int c = 0; c < 3; c++) out[c + 1] = static_cast<float>((q[c] * multiple + 0.0) * over);
   }
   return outside != 0;
@@ -103,54 +100,45 @@ bool round_quats(int64_t n, double levels, double multiple, const float* quats, 
 
 // Splits n colours [n, 3] into three arrays, each value times a factor.
 template <typename Real>
-void split(int n, const float* rgb, Real factor, Real* r, Real* g, Real* b) {
-  for (int i = 0; i < n; i++) {
+void split(int64_t n, const float* rgb, Real factor, Real* r, Real* g, Real* b) {
+  for (int64_t i = 0; i < n; i++) {
     r[i] = rgb[3 * i] * factor;
     g[i] = rgb[3 * i + 1] * factor;
     b[i] = rgb[3 * i + 2] * factor;
   }
 }
 
-// Quantises n <= kColours colours to multiples of 2**coarse steps.
+// Quantises colours `begin` to `end` to multiples of 2**coarse steps; `coarse` is null for 0.
 template <typename Real>
-bool round_colours(int n, double step, int shift, const int* coarse, const float* rgb, float* out) {
-  Real r[kColours], g[kColours], b[kColours], finer[kColours];
-  split(n, rgb, static_cast<Real>(1.0 / step), r, g, b);
-  const Real part = static_cast<Real>(std::ldexp(1.0, -shift));
-  for (int i = 0; i < n; i++) finer[i] = static_cast<Real>(1.0f / static_cast<float>(1 << coarse[i]));
+bool round_colours(int64_t begin, int64_t end, double step, int shift, const int* coarse, const float* rgb,
+                   float* out) {
+  const Real part = static_cast<Real>(std::ldexp(1.0, -shift)), most = kMostSteps;
   int outside = 0;
-  float decoded[3][kColours];
-  for (int i = 0; i < n; i++) {
-    const Real most = kMostSteps;
-    const int beyond = !(std::fabs(r[i]) < most) | !(std::fabs(g[i]) < most) | !(std::fabs(b[i]) < most);
-    outside |= beyond;
-    if (beyond) r[i] = g[i] = b[i] = Real(0);
-    const auto rounded = [&](Real a) { return static_cast<int>(std::rint(a * finer[i])) * (1 << coarse[i]); };
-    const int co = rounded((r[i] - b[i]) * part) * (1 << shift);
-    const int cg = rounded((g[i] - (r[i] + b[i]) * Real(0.5)) * part) * (1 << shift);
-    Real luma = r[i] + g[i] + b[i] - static_cast<Real>(cg + co - 2 * (co >> 1));
-    luma = luma / Real(3) + static_cast<Real>(cg >> 1);
-    const int t = rounded(luma) - (cg >> 1), blue = t - (co >> 1);
-    decoded[0][i] = static_cast<float>(static_cast<double>(blue + co) * step);
-    decoded[1][i] = static_cast<float>(static_cast<double>(cg + t) * step);
-    decoded[2][i] = static_cast<float>(static_cast<double>(blue) * step);
+  for (; begin < end; begin += kColours) {
+    const int64_t n = std::min<int64_t>(end - begin, kColours);
+    Real r[kColours], g[kColours], b[kColours];
+    float decoded[3][kColours];
+    int factors[kColours];
+    for (int64_t i = 0; i < n; i++) factors[i] = coarse ? 1 << coarse[begin + i] : 1;
+    split(n, rgb + 3 * begin, static_cast<Real>(1.0 / step), r, g, b);
+    for (int64_t i = 0; i < n; i++) {
+      const int beyond = !(std::fabs(r[i]) < most) | !(std::fabs(g[i]) < most) | !(std::fabs(b[i]) < most);
+      outside |= beyond;
+      if (beyond) r[i] = g[i] = b[i] = Real(0);
+      const Real finer = static_cast<Real>(1.0f / static_cast<float>(factors[i]));
+      const auto rounded = [&](Real a) { return static_cast<int>(std::rint(a * finer)) * factors[i]; };
+      const int co = rounded((r[i] - b[i]) * part) * (1 << shift);
+      const int cg = rounded((g[i] - (r[i] + b[i]) * Real(0.5)) * part) * (1 << shift);
+      const Real luma = (r[i] + g[i] + b[i] - static_cast<Real>(cg + co - 2 * (co >> 1))) / Real(3);
+      const int t = rounded(luma + static_cast<Real>(cg >> 1)) - (cg >> 1), blue = t - (co >> 1);
+      decoded[0][i] = static_cast<float>(static_cast<double>(blue + co) * step);
+      decoded[1][i] = static_cast<float>(static_cast<double>(cg + t) * step);
+      decoded[2][i] = static_cast<float>(static_cast<double>(blue) * step);
+    }
+    for (int64_t i = 0; i < n; i++)
+      for (int c = 0; c < 3; c++) out[3 * (begin + i) + c] = decoded[c][i];
   }
-  for (int i = 0; i < n; i++)
-    for (int c = 0; c < 3; c++) out[3 * i + c] = decoded[c][i];
   return outside != 0;
-}
-
-// Calls function(width) with a constant for the widths of quats, scales, and SH of degree 1 to 3.
-template <typename Function>
-void with_width(int64_t width, Function&& function) {
-  switch (width) {
-    case 3: return function(std::integral_constant<size_t, 3>());
-    case 4: return function(std::integral_constant<size_t, 4>());
-    case 9: return function(std::integral_constant<size_t, 9>());
-    case 24: return function(std::integral_constant<size_t, 24>());
-    case 45: return function(std::integral_constant<size_t, 45>());
-    default: return function(static_cast<size_t>(width));
-  }
 }
 
 // Returns the integer of a value, limited to ± `most`, where NaN has −most.
@@ -173,20 +161,14 @@ CSPLAT_API int64_t csplat_dequantise_splats(int64_t threads, int64_t rows, int64
                                             const float* alphas, const float* colours, float* decoded_means,
                                             float* decoded_alphas, float* decoded_colours) {
   return over_tiles(threads, rows, tile_count, tiles, [=](int64_t begin, int64_t end, const Tile& tile) {
-    const int coarse[kColours] = {}, k = static_cast<int>(shift);
+    const int k = static_cast<int>(shift);
     const double most = std::fmin(1e38, 4503599627370496.0 * tile.mean_step);  // 2**52 steps
     bool outside = round_to_lattice<double>(3 * (end - begin), tile.mean_step, most, means + 3 * begin,
                                             decoded_means + 3 * begin);
     outside |= round_opacities(end - begin, static_cast<double>(opacity_levels), tile.opacity_multiple, alphas + begin,
                                decoded_alphas + begin);
-    for (; begin < end; begin += kColours) {
-      const int n = static_cast<int>(end - begin < kColours ? end - begin : kColours);
-      const float* from = colours + 3 * begin;
-      float* to = decoded_colours + 3 * begin;
-      outside |= tile.in_double ? round_colours<double>(n, tile.colour_step, k, coarse, from, to)
-                                : round_colours<float>(n, tile.colour_step, k, coarse, from, to);
-    }
-    return outside;
+    const auto round = tile.in_double ? round_colours<double> : round_colours<float>;
+    return outside | round(begin, end, tile.colour_step, k, nullptr, colours, decoded_colours);
   });
 }
 
@@ -204,49 +186,14 @@ CSPLAT_API int64_t csplat_dequantise_shapes(int64_t threads, int64_t rows, int64
   });
 }
 
-// Decodes SH [rows, width, 3], rounded to multiples of 2**coarse [rows] steps; returns the number of runs with values
-// to leave to NumPy.
-CSPLAT_API int64_t csplat_dequantise_sh(int64_t threads, int64_t rows, int64_t width, double step, int64_t shift,
-                                        const int* coarse, const float* sh, float* decoded) {
-  const Tile tile = {};
-  return over_tiles(threads, rows, 1, &tile, [=](int64_t begin, int64_t end, const Tile&) {
-    bool outside = false;
-    for (const int64_t most = kColours / width; begin < end; begin += most) {
-      const int64_t stop = begin + most < end ? begin + most : end;
-      int exponents[kColours], n = 0;
-      for (int64_t row = begin; row < stop; row++)
-        for (int64_t k = 0; k < width; k++) exponents[n++] = coarse[row];
-      const int64_t place = 3 * width * begin;
-      outside |= round_colours<float>(n, step, static_cast<int>(shift), exponents, sh + place, decoded + place);
-    }
-    return outside;
+// Decodes n colours of SH, rounded to multiples of 2**coarse [n] steps; returns the number of runs with values to leave
+// to NumPy.
+CSPLAT_API int64_t csplat_dequantise_sh(int64_t threads, int64_t n, double step, int64_t shift, const int* coarse,
+                                        const float* sh, float* decoded) {
+  const Tile all = {};
+  return over_tiles(threads, n, 1, &all, [=](int64_t begin, int64_t end, const Tile&) {
+    return round_colours<float>(begin, end, step, static_cast<int>(shift), coarse, sh, decoded);
   });
-}
-
-// Sets out [splats, width] to the rows of the splats.
-CSPLAT_API int64_t csplat_take_rows(int64_t threads, int64_t splats, int64_t width, const int64_t* row,
-                                    const float* rows, float* out) {
-  parallel_runs(threads, splats, kRun, [=](int64_t begin, int64_t end, int) {
-    with_width(width, [=](auto w) {
-      for (int64_t i = begin; i < end; i++) std::memcpy(out + i * w, rows + row[i] * w, sizeof(float) * w);
-    });
-  });
-  return 0;
-}
-
-// Rounds sizes [splats] to their lattice, and adds them to decoded log scales [splats, 3].
-CSPLAT_API int64_t csplat_add_sizes(int64_t threads, int64_t splats, double step, const float* sizes, float* scales,
-                                    float* decoded_sizes) {
-  parallel_runs(threads, splats, kRun, [=](int64_t begin, int64_t end, int) {
-    const float divisor = static_cast<float>(step);
-    for (int64_t i = begin; i < end; i++) {
-      const double size = std::rint(sizes[i] / divisor) + 0.0;
-      decoded_sizes[i] = static_cast<float>(size * step);
-      for (int64_t k = 3 * i; k < 3 * i + 3; k++)
-        scales[k] = static_cast<float>((std::rint(scales[k] / step) + size) * step);
-    }
-  });
-  return 0;
 }
 
 // Sets out [rows, width] to the sums of the values [splats, width] over the splats of each row. `starts` [rows + 1] is
@@ -259,13 +206,18 @@ CSPLAT_API int64_t csplat_sum_by_row(int64_t threads, int64_t splats, int64_t wi
       return n == threads ? rows : std::lower_bound(starts, starts + rows, n * splats / threads) - starts;
     };
     const int64_t begin = bound(part), end = bound(part + 1);
-    with_width(width, [=](auto w) {
-      std::memset(out + begin * w, 0, sizeof(float) * w * static_cast<size_t>(end - begin));
-      for (int64_t i = 0; i < splats; i++) {
-        if (row[i] < begin || row[i] >= end) continue;
-        for (int64_t c = 0; c < static_cast<int64_t>(w); c++) out[row[i] * w + c] += values[i * w + c];
-      }
-    });
+    std::fill(out + begin * width, out + end * width, 0.0f);
+    const auto add = [=](auto w) {
+      for (int64_t i = 0; i < splats; i++)
+        if (row[i] >= begin && row[i] < end)
+          for (int64_t c = 0; c < w; c++) out[row[i] * w + c] += values[i * w + c];
+    };
+    switch (width) {
+      case 3: return add(std::integral_constant<int64_t, 3>());
+      case 4: return add(std::integral_constant<int64_t, 4>());
+      case 45: return add(std::integral_constant<int64_t, 45>());
+      default: add(width);
+    }
   });
   return 0;
 }
@@ -275,36 +227,22 @@ CSPLAT_API int64_t csplat_sum_by_row(int64_t threads, int64_t splats, int64_t wi
 CSPLAT_API int64_t csplat_add_slopes(int64_t threads, int64_t rows, int64_t width, int64_t first, double step,
                                      double per_bit, const float* tables, const float* seen, float* gradients) {
   const float over = static_cast<float>(1.0 / step), weight = static_cast<float>(per_bit) * over;
-  int base[kColours], most = kColours - kColours % static_cast<int>(width);
+  const int64_t most = kColours / width * width;
+  int places[kColours];  // of the integer 0 in the tables
   float weights[kColours];
-  for (int i = 0; i < most; i++) {
-    const int column = i % static_cast<int>(width) - static_cast<int>(first);
-    base[i] = kReach + (column < 0 ? 0 : column * kTable);
+  for (int64_t i = 0; i < most; i++) {
+    const int64_t column = i % width - first;
+    places[i] = static_cast<int>(std::max<int64_t>(column, 0)) * kTable + kReach;
     weights[i] = column < 0 ? 0.0f : weight;
   }
   parallel_runs(threads, rows * width, most * 16, [&](int64_t begin, int64_t end, int) {
     for (; begin < end; begin += most) {
-      const int n = static_cast<int>(end - begin < most ? end - begin : most);
-      int places[kColours];
+      const int64_t n = std::min(most, end - begin);
+      int own[kColours];
       float slopes[kColours];
-      for (int i = 0; i < n; i++) places[i] = base[i] + integer_of(seen[begin + i] * over, kReach);
-      for (int i = 0; i < n; i++) slopes[i] = tables[places[i]];
-      for (int i = 0; i < n; i++) gradients[begin + i] += weights[i] * slopes[i];
-    }
-  });
-  return 0;
-}
-
-// Adds the slopes of decoded opacities [rows] to gradients of logits. The level is M √alpha, whose derivative by the
-// logit is M √alpha (1 − alpha) / 2.
-CSPLAT_API int64_t csplat_add_opacity_slopes(int64_t threads, int64_t rows, double levels, double per_bit,
-                                             const float* table, const float* alphas, float* gradients) {
-  const float most = static_cast<float>(levels), half = static_cast<float>(0.5 * levels);
-  const float weight = static_cast<float>(per_bit);
-  parallel_runs(threads, rows, kRun, [=](int64_t begin, int64_t end, int) {
-    for (int64_t i = begin; i < end; i++) {
-      const float root = std::sqrt(alphas[i]), chain = half * root * (1.0f - alphas[i]);
-      gradients[i] += weight * chain * table[kReach + integer_of(root * most, kReach)];
+      for (int64_t i = 0; i < n; i++) own[i] = places[i] + integer_of(seen[begin + i] * over, kReach);
+      for (int64_t i = 0; i < n; i++) slopes[i] = tables[own[i]];
+      for (int64_t i = 0; i < n; i++) gradients[begin + i] += weights[i] * slopes[i];
     }
   });
   return 0;
@@ -318,57 +256,33 @@ CSPLAT_API int64_t csplat_add_colour_slopes(int64_t threads, int64_t rows, int64
                                             float* gradients) {
   const float over = static_cast<float>(1.0 / step), weight = static_cast<float>(per_bit) * over;
   const float chroma = static_cast<float>(std::ldexp(1.0, -static_cast<int>(shift)));
-  const int64_t most = kColours / width;
-  int first[kColours];  // places of the integer 0 of Y in the tables
-  for (int i = 0; i < kColours; i++) first[i] = 3 * kTable * static_cast<int>(i % width) + kReach;
-  parallel_runs(threads, rows, most * (kRun / most), [&](int64_t begin, int64_t end, int) {
+  const int64_t most = kColours / width * width;
+  int places[kColours];  // of the integer 0 of Y in the tables
+  for (int i = 0; i < kColours; i++) places[i] = 3 * kTable * static_cast<int>(i % width) + kReach;
+  parallel_runs(threads, rows * width, most * 16, [&](int64_t begin, int64_t end, int) {
     for (; begin < end; begin += most) {
-      const int n = static_cast<int>(width * (begin + most < end ? most : end - begin));
-      const float* values = seen + 3 * width * begin;
-      float* to = gradients + 3 * width * begin;
-      float r[kColours], g[kColours], b[kColours];
+      const int64_t n = std::min(most, end - begin);
+      float r[kColours], g[kColours], b[kColours], *to = gradients + 3 * begin;
       int y[kColours], co[kColours], cg[kColours];
-      split(n, values, over, r, g, b);
-      for (int i = 0; i < n; i++) {
-        const int red = integer_of(r[i], 1 << 24), green = integer_of(g[i], 1 << 24);
-        const int blue = integer_of(b[i], 1 << 24);
+      split(n, seen + 3 * begin, over, r, g, b);
+      for (int64_t i = 0; i < n; i++) {
+        const int red = integer_of(r[i], 1 << 24), green = integer_of(g[i], 1 << 24), blue = integer_of(b[i], 1 << 24);
         const int difference = red - blue, t = blue + (difference >> 1), rest = green - t;
-        y[i] = first[i] + limited(t + (rest >> 1));
-        co[i] = first[i] + kTable + limited(difference >> shift);
-        cg[i] = first[i] + 2 * kTable + limited(rest >> shift);
+        y[i] = places[i] + limited(t + (rest >> 1));
+        co[i] = places[i] + kTable + limited(difference >> shift);
+        cg[i] = places[i] + 2 * kTable + limited(rest >> shift);
       }
-      for (int i = 0; i < n; i++) {
+      for (int64_t i = 0; i < n; i++) {
         r[i] = tables[y[i]];
         g[i] = chroma * tables[co[i]];
         b[i] = chroma * tables[cg[i]];
       }
-      for (int i = 0; i < n; i++) {
+      for (int64_t i = 0; i < n; i++) {
         to[3 * i] += weight * (0.25f * r[i] + g[i] - 0.5f * b[i]);
         to[3 * i + 1] += weight * (0.5f * r[i] + b[i]);
         to[3 * i + 2] += weight * (0.25f * r[i] - g[i] - 0.5f * b[i]);
       }
     }
   });
-  return 0;
-}
-
-// Restricts values to those that a file can represent: means [rows, 3] to their boxes, quats [shapes, 4] to w >= 0,
-// and SH [coefficients, 3] to 0 where `zero` is true, if it is given.
-CSPLAT_API int64_t csplat_constrain_values(int64_t threads, int64_t rows, const float* low, const float* high,
-                                           float* means, int64_t shapes, float* quats, int64_t coefficients,
-                                           const bool* zero, float* sh) {
-  parallel_runs(threads, rows, kRun, [=](int64_t begin, int64_t end, int) {
-    for (int64_t i = 3 * begin; i < 3 * end; i++)
-      means[i] = means[i] < low[i] ? low[i] : means[i] > high[i] ? high[i] : means[i];
-  });
-  parallel_runs(threads, shapes, kRun, [=](int64_t begin, int64_t end, int) {
-    for (int64_t i = begin; i < end; i++)
-      for (float* q = quats + 4 * i, *stop = quats[4 * i] < 0.0f ? q + 4 : q; q < stop; q++) *q = -*q;
-  });
-  if (zero)
-    parallel_runs(threads, coefficients, 16 * kRun, [=](int64_t begin, int64_t end, int) {
-      for (int64_t i = begin; i < end; i++)
-        for (int c = 0; c < 3; c++) sh[3 * i + c] = zero[i] ? 0.0f : sh[3 * i + c];
-    });
   return 0;
 }

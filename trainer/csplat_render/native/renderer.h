@@ -13,6 +13,7 @@
 
 namespace csplat {
 
+// As in csplat_render.conventions.
 constexpr int kTile = 16;                // width and height of a tile, pixels
 constexpr double kDilation = 0.3;        // square pixels, added to both variances on the image
 constexpr double kLogScaleLimit = 80.0;  // log scales are clamped to ± this
@@ -70,6 +71,7 @@ class Array {
   void reserve(size_t size, size_t kept = 0) {
     if (size <= size_) return;
     size = std::max(size, size_ + size_ / 4);
+    if (!kept) free();
     T* data = static_cast<T*>(::operator new(size * sizeof(T), kAlignment));
     if (kept) std::memcpy(static_cast<void*>(data), data_, kept * sizeof(T));
     free();
@@ -89,6 +91,8 @@ class Array {
   static constexpr std::align_val_t kAlignment{64};
   void free() {
     if (data_) ::operator delete(data_, kAlignment);
+    data_ = nullptr;
+    size_ = 0;
   }
 
   T* data_ = nullptr;

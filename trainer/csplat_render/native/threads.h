@@ -7,7 +7,6 @@
 #include <exception>
 #include <mutex>
 #include <new>
-#include <system_error>
 #include <thread>
 #include <type_traits>
 
@@ -32,7 +31,7 @@ class Threads {
     }
     try {
       for (; helpers_ < threads - 1; helpers_++) std::thread([this, number = helpers_ + 1] { serve(number); }).detach();
-    } catch (const std::system_error&) {
+    } catch (const std::exception&) {
       threads = helpers_ + 1;  // the system gives no more
     }
     std::unique_lock<std::mutex> lock(mutex_);

@@ -20,10 +20,8 @@ CSPLAT_API int64_t csplat_compose(int64_t threads, const uint8_t* pixels, int64_
                                   const float* background, float* out) {
   constexpr float over = 1.0f / 255.0f;
   parallel_runs(threads, count, kRun, [&](int64_t begin, int64_t end, int) {
-    if (channels == 3) {
-      for (int64_t i = 3 * begin; i < 3 * end; i++) out[i] = pixels[i] * over;
-      return;
-    }
+    for (int64_t i = 3 * begin; channels == 3 && i < 3 * end; i++) out[i] = pixels[i] * over;
+    if (channels == 3) return;
     const float behind[3] = {background[0], background[1], background[2]};
     for (int64_t i = begin; i < end; i++) {
       const float alpha = pixels[4 * i + 3] * over, rest = 1.0f - alpha;
@@ -41,27 +39,21 @@ CSPLAT_API int64_t csplat_add_noise(int64_t threads, int64_t count, float* means
                                     const float* scales, const float* logits, const float* normals, double strength,
                                     double logit_max, double slope, double centre, double most) {
   parallel_runs(threads, count, kGroup, [&](int64_t begin, int64_t end, int) {
-    int64_t chosen[kGroup];
-    double deviations[3][kGroup] = {}, gates[kGroup] = {};  // gates contain the exponents first
-    int64_t chosen_count = 0;
-    for (int64_t i = begin; i < end; i++) {
-      chosen[chosen_count] = i;
-      chosen_count += !(logits[i] > logit_max);
-    }
-    for (int64_t n = 0; n < chosen_count; n++) {
-      const int64_t i = chosen[n];
-      const auto limited = [](double power) { return std::min(std::max(power, -700.0), 700.0); };  // NaN stays
-      for (int k = 0; k < 3; k++) deviations[k][n] = limited(scales[3 * i + k]);
-      gates[n] = limited(-logits[i]);
+    const int64_t group = end - begin;
+    double deviations[3][kGroup] = {}, gates[kGroup] = {};  // their exponents first
+    const auto limited = [](double power) { return std::min(std::max(power, -700.0), 700.0); };  // NaN stays
+    for (int64_t n = 0; n < group; n++) {
+      for (int k = 0; k < 3; k++) deviations[k][n] = limited(scales[3 * (begin + n) + k]);
+      gates[n] = limited(-logits[begin + n]);
     }
     const Doubles one = all(1.0);
-    for (int64_t n = 0; n < chosen_count; n += kDoubles) {
+    for (int64_t n = 0; n < group; n += kDoubles) {
       for (double* row : deviations) store(row + n, exp(load(row + n)));
       const Doubles alpha = one / (one + exp(load(gates + n)));
       store(gates + n, all(strength) / (one + exp(all(-slope) * (one - alpha - all(centre)))));
     }
-    for (int64_t n = 0; n < chosen_count; n++) {
-      const int64_t i = chosen[n];
+    for (int64_t i = begin, n = 0; i < end; i++, n++) {
+      if (logits[i] > logit_max) continue;
       const double w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
       const double rotation[3][3] = {
           {1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)},

@@ -18,7 +18,6 @@ from csplat.ply.ply_reader import parse_ply
 from csplat.scene_metadata import UNSPECIFIED, Direction, TrainingRecord
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
-from csplat_render.kernels import call
 from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name, printable
 from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, rgb_pixels
 from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
@@ -300,6 +299,7 @@ def split_listed(
     return train, val, test
 
 
+_ROWS = 8  # rows of pixels that are interpolated at once, in caches
 _ALPHA_MIN = 1e-3  # of 255; divisor of interpolated colours where alpha is 0, and the colour does not matter
 
 # EXIF orientations that swap width and height, and the inverse: quarter turns anticlockwise, then a flip.
@@ -424,8 +424,29 @@ def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)
-    result = np.empty(pixels.shape, np.uint8)
-    call("interpolate", np.ascontiguousarray(pixels), *pixels.shape, x, y, x.size, _ALPHA_MIN, result)
+    planes = np.moveaxis(pixels, 2, 0).astype(np.float64)
+    if len(planes) == 4:
+        planes[:3] *= planes[3]
+    rows = [slice(row, row + _ROWS) for row in range(0, height, _ROWS)]
+    return np.concatenate([_interpolate(planes, x[some], y[some]) for some in rows])
+
+
+def _interpolate(planes: F64, x: F64, y: F64) -> U8:
+    """Interpolate between the pixels of [C, H, W] at positions [...], pixels, and return [..., C], rounded.
+
+    If there are four planes, the fourth is alpha, by which the others were multiplied.
+    """
+    last = np.array(planes.shape[1:]) - 1
+    column, row = np.clip(x - 0.5, 0, last[1]), np.clip(y - 0.5, 0, last[0])
+    left, top = column.astype(np.int64), row.astype(np.int64)
+    s, t = column - left, row - top
+    values = np.zeros((len(planes), *x.shape))
+    for j, by_row in ((top, 1.0 - t), (np.minimum(top + 1, last[0]), t)):
+        for i, by_column in ((left, 1.0 - s), (np.minimum(left + 1, last[1]), s)):
+            values += planes[:, j, i] * by_row * by_column
+    if len(planes) == 4:
+        values[:3] /= np.maximum(values[3], _ALPHA_MIN)
+    result: U8 = np.moveaxis(np.minimum(np.rint(values), 255.0).astype(np.uint8), 0, -1)
     return result
 
 
