@@ -313,12 +313,7 @@ void block_gradients(const Renderer& renderer, const Splats& splats, const View&
   for (int lane = 0; lane < kBlock; lane += kDoubles)
     shape_gradients(splats, view, values, sums, lane, lanes, centres);
   view_directions(values, view.camera, directions, over_distance);
-  for (int lane = 0; lane < kBlock; lane += kFloats) {
-    const float* d = directions + lane;
-    Floats functions[kBasis];
-    sh_basis(splats.degree, load(d), load(d + kBlock), load(d + 2 * kBlock), functions);
-    for (int k = 0; k <= higher; k++) store(basis + k * kBlock + lane, functions[k]);
-  }
+  block_basis(splats.degree, directions, basis);
   const int row = 3 * static_cast<int>(splats.coefficients);
   std::memset(out.shN, 0, static_cast<size_t>(row) * kBlock * sizeof(float));
   std::memset(weights, 0, sizeof weights);

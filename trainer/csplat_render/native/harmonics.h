@@ -46,6 +46,16 @@ inline void sh_basis(int64_t degree, Floats x, Floats y, Floats z, Floats* basis
   basis[24] = 0.6258357354491761f * (xx * (xx - 3.0f * yy) - yy * (3.0f * xx - yy));
 }
 
+// Writes the functions in the directions of a block, [3, 16], as [functions, 16].
+inline void block_basis(int64_t degree, const float* directions, float* basis) {
+  for (int lane = 0; lane < kBlock; lane += kFloats) {
+    const float* d = directions + lane;
+    Floats functions[kBasis];
+    sh_basis(degree, load(d), load(d + kBlock), load(d + 2 * kBlock), functions);
+    for (int k = 0; k < (degree + 1) * (degree + 1); k++) store(basis + k * kBlock + lane, functions[k]);
+  }
+}
+
 // Computes the gradient of Σ g[k] · basis[k] with respect to x, y and z as independent variables.
 inline void sh_basis_gradient(int64_t degree, Floats x, Floats y, Floats z, const Floats* g, Floats* gradient) {
   Floats gx = all(0.0f), gy = gx, gz = gx;

@@ -122,19 +122,6 @@ bool all_finite(const float* values, int count) {
   return !infinite;
 }
 
-// Writes the functions of the basis in the direction of each splat of a block, [kBasis, 16].
-void block_basis(const Splats& splats, const float* values, const View& view, float* basis) {
-  alignas(64) float directions[3 * kBlock];
-  alignas(64) double over_distance[kBlock];
-  view_directions(values, view.camera, directions, over_distance);
-  for (int lane = 0; lane < kBlock; lane += kFloats) {
-    const float* d = directions + lane;
-    Floats functions[kBasis];
-    sh_basis(splats.degree, load(d), load(d + kBlock), load(d + 2 * kBlock), functions);
-    for (int k = 0; k <= splats.higher(); k++) store(basis + k * kBlock + lane, functions[k]);
-  }
-}
-
 // Projects a block, and returns the number of its splats with NaN or infinity; 0 unless `count_bad`.
 int64_t project_block(Renderer& renderer, const Splats& splats, const View& view, double log2_least, int64_t block,
                       float* radii, bool count_bad) {
@@ -165,7 +152,10 @@ int64_t project_block(Renderer& renderer, const Splats& splats, const View& view
     }
   if (!drawn) return bad;
   alignas(64) float basis[kBasis * kBlock];
-  block_basis(splats, values, view, basis);
+  alignas(64) float directions[3 * kBlock];
+  alignas(64) double over_distance[kBlock];
+  view_directions(values, view.camera, directions, over_distance);
+  block_basis(splats.degree, directions, basis);
   for (; drawn; drawn &= drawn - 1) {
     const int lane = __builtin_ctz(drawn);
     const int64_t i = first + lane;

@@ -127,12 +127,7 @@ void add_block(const Renderer& renderer, const Splats& splats, const View& view,
   alignas(64) double over_distance[kBlock];
   load_block(splats, block, values);
   view_directions(values, view.camera, directions, over_distance);
-  for (int lane = 0; lane < kBlock; lane += kFloats) {
-    const float* d = directions + lane;
-    Floats functions[kBasis];
-    sh_basis(splats.degree, load(d), load(d + kBlock), load(d + 2 * kBlock), functions);
-    for (int k = 0; k < size; k++) store(basis + k * kBlock + lane, functions[k]);
-  }
+  block_basis(splats.degree, directions, basis);
   for (int lane = 0; lane < count; lane++) {
     const int64_t i = first + lane;
     if (!renderer.tile_counts[i]) continue;

@@ -85,7 +85,6 @@ inline Doubles floor(Doubles a) {
 inline double first_lane(Doubles a) { return a.v[0]; }
 
 inline Mask at_least(Floats a, Floats b) { return {a.v >= b.v}; }
-inline Floats select(Mask m, Floats a, Floats b) { return {m.v ? a.v : b.v}; }
 inline IntVector float_bits(Floats a) { return reinterpret_cast<IntVector>(a.v); }
 inline Floats from_bits(IntVector a) { return {reinterpret_cast<FloatVector>(a)}; }
 inline Floats keep(Mask m, Floats a) { return from_bits(m.v & float_bits(a)); }

@@ -67,7 +67,6 @@ inline void store(float* p, Eights a) { _mm256_storeu_ps(p, a.v); }
 #ifdef __AVX512F__
 
 inline Mask at_least(Floats a, Floats b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
-inline Floats select(Mask m, Floats a, Floats b) { return {_mm512_mask_blend_ps(m, b.v, a.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm512_maskz_mov_ps(m, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm512_maskz_mov_ps(static_cast<Mask>(~m), a.v)}; }
 inline unsigned bits(Mask m) { return m; }
@@ -101,7 +100,6 @@ inline Eights fold(const Floats* parts) {
 #else
 
 inline Mask at_least(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
-inline Floats select(Mask m, Floats a, Floats b) { return {_mm256_blendv_ps(b.v, a.v, m.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm256_and_ps(m.v, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm256_andnot_ps(m.v, a.v)}; }
 inline unsigned bits(Mask m) { return static_cast<unsigned>(_mm256_movemask_ps(m.v)); }
