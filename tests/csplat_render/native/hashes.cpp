@@ -1,5 +1,6 @@
 // Prints hashes of what the renderer computes for made splats: images, gradients, pruning errors, sensitivities, and
-// the values after 50 steps of a refit, once for each of 1, 2 and 8 threads. All lines must be equal, on every processor.
+// the values after 50 steps of a refit, once for each of 1, 2 and 8 threads. All lines must be equal, on every
+// processor.
 //
 // Compile with the sources of the library.
 #include <cmath>
@@ -72,8 +73,8 @@ struct Scene {
 View view_from(double angle) {
   View view = {};
   const double c = std::sqrt(1.0 - angle * angle), s = angle, distance = 5.0;
-  const double camera[24] = {c, 0, s, 0, 1, 0, -s, 0, c, 0.1, -0.2, distance, 110, 105, 0.5 * kWidth, 0.5 * kHeight, 0.2,
-                             -0.7, 0.7, -0.6, 0.6, s * distance, 0.2, -c * distance};
+  const double camera[24] = {c, 0, s, 0, 1, 0, -s, 0, c, 0.1, -0.2, distance, 110, 105, 0.5 * kWidth, 0.5 * kHeight,
+                             0.2, -0.7, 0.7, -0.6, 0.6, s * distance, 0.2, -c * distance};
   std::copy(camera, camera + 24, view.camera);
   view.alpha_min = 1.0 / 255.0;
   view.transmittance_min = 1e-4;

@@ -15,8 +15,7 @@
 //
 //     max of the exponent <= constant + Σ over x and y of max{|k| t − K t² : 0 <= t <= half the size}
 //
-// Alphas and weights are kept for the way back. A part is the lanes of a square that fit in a register: two with AVX2,
-// which are left out independently, since this adds zeros to sums that have the same order without.
+// Alphas and weights are kept for the way back. A part is the lanes of a square that fit in a register: two with AVX2.
 #pragma once
 
 #include <cmath>
@@ -28,10 +27,8 @@ namespace csplat {
 constexpr int kTilePixels = kTile * kTile;
 constexpr int kSquare = 4;                        // width and height of a square, pixels
 constexpr int kSquares = kTilePixels / kBlock;    // squares per tile
-constexpr int kRows = kBlock / kParts / kSquare;  // rows of a part
-constexpr int kBatch = 8;                         // splats that are expanded before they are blended
+constexpr int kBatch = 16;                        // splats that are expanded before they are blended
 constexpr float kMargin = 0.01f;                  // margin of the bounds of exponents of 2, for rounding
-constexpr uint32_t kAllParts = kParts == 1 ? 0xFFFF : 0xFFFFFFFF;
 constexpr uint32_t kAllSquares = (1u << kSquares) - 1, kAllLanes = (1u << kFloats) - 1;
 constexpr size_t kMostKept = 2 * kTilePixels;  // numbers that a splat keeps at most
 
@@ -63,14 +60,14 @@ struct Tile {
   alignas(64) float transmittance[kTilePixels];  // negative for finished pixels
   alignas(64) float colour[3][kTilePixels], depth[kTilePixels];
   int left, top, columns, rows;
-  uint32_t unfinished;  // a bit for each part: those of the first part of each square, then those of the second
+  uint32_t unfinished;  // a bit for each square
 };
 
 // The exponent of a splat about the centre of each square: constant + x_slope x + y_slope y + bend.
 struct Exponents {
   alignas(64) float constant[kSquares], x_slope[kSquares], y_slope[kSquares], bend[kBlock];
-  float colour[3], depth;
-  uint32_t visible;  // a bit for each part
+  const Splat* splat;
+  uint32_t visible;  // a bit for each square
 };
 
 struct Limits {
@@ -84,18 +81,20 @@ struct Limits {
 // Calls function(pixel, place of the pixel in a tile) for each pixel of a tile on the image.
 template <typename Function>
 void for_each_pixel(const Tile& tile, const View& view, Function&& function) {
-  for (int y = 0; y < tile.rows; y++)
-    for (int x = 0; x < tile.columns; x++)
-      function(static_cast<size_t>(tile.top + y) * view.width + tile.left + x,
-               (y / kSquare * kSquare + x / kSquare) * kBlock + y % kSquare * kSquare + x % kSquare);
+  for (int y = 0; y < tile.rows; y++) {
+    const size_t row = static_cast<size_t>(tile.top + y) * view.width + tile.left;
+    for (int x = 0, place = y / kSquare * kSquare * kBlock + y % kSquare * kSquare; x < tile.columns; place += kBlock)
+      for (const int end = x + kSquare, from = x; x < end && x < tile.columns; x++) function(row + x, place + x - from);
+  }
 }
 
-// Clears the bits of parts whose pixels are finished. Done between batches: within, each splat would wait for the last.
+// Clears the bits of finished squares. Done between batches: within, each splat would wait for the last.
 inline void update_unfinished(Tile& tile) {
   for (uint32_t rest = tile.unfinished; rest; rest &= rest - 1) {
-    const int bit = __builtin_ctz(rest);
-    const Floats t = load(tile.transmittance + bit % kSquares * kBlock + bit / kSquares * kFloats);
-    if (negative_lanes(t) == kAllLanes) tile.unfinished &= ~(1u << bit);
+    const float* t = tile.transmittance + __builtin_ctz(rest) * kBlock;
+    uint32_t finished = kAllLanes;
+    for (int lanes = 0; lanes < kBlock; lanes += kFloats) finished &= negative_lanes(load(t + lanes));
+    if (finished == kAllLanes) tile.unfinished ^= rest & -rest;
   }
 }
 
@@ -108,7 +107,7 @@ inline void begin_tile(const View& view, int index, Tile& tile) {
   std::memset(tile.depth, 0, sizeof tile.depth);
   for (float& t : tile.transmittance) t = -1.0f;
   for_each_pixel(tile, view, [&](size_t, int place) { tile.transmittance[place] = 1.0f; });
-  tile.unfinished = kAllParts;
+  tile.unfinished = kAllSquares;
 }
 
 // Returns the maximum of |k| t − K t² for 0 <= t <= size.
@@ -117,7 +116,7 @@ inline Floats highest(Floats slope, Floats curvature, Floats half_over_curvature
   return t * fnma(curvature, t, k);
 }
 
-// Expands the exponent of a splat in a tile, and marks the parts in which it may be at least `least`.
+// Expands the exponent of a splat in a tile, and marks the squares in which it may be at least `least`.
 inline void expand(const Splat& s, const Tile& tile, float least, Exponents& e) {
   const double dx = tile.left + 0.5 * kTile - s.x, dy = tile.top + 0.5 * kTile - s.y;
   const double constant = std::fma(std::fma(s.xx, dx, s.xy * dy), dx, std::fma(s.yy * dy, dy, s.log2_opacity));
@@ -138,11 +137,10 @@ inline void expand(const Splat& s, const Tile& tile, float least, Exponents& e) 
     const Floats square = fma(float_xx, load(kPositions.lane_xx + lanes), float_yy * load(kPositions.lane_yy + lanes));
     store(e.bend + lanes, fma(float_xy, load(kPositions.lane_xy + lanes), square));
   }
-  for (int c = 0; c < 3; c++) e.colour[c] = s.colour[c];
-  e.depth = s.depth;
+  e.splat = &s;
 
   const Floats K = all(s.curvature), half_over = all(0.5f / s.curvature), lowest = all(least);
-  const Floats half_width = all(0.5f * (kSquare - 1)), half_height = all(0.5f * (kRows - 1));
+  const Floats half_size = all(0.5f * (kSquare - 1));
   e.visible = 0;
   for (int square = 0; square < kSquares; square += kFloats) {
     const int row = square / kSquare;
@@ -150,49 +148,46 @@ inline void expand(const Splat& s, const Tile& tile, float least, Exponents& e) 
     store(e.constant + square, k0);
     store(e.x_slope + square, kx);
     store(e.y_slope + square, ky);
-    for (int part = 0; part < kParts; part++) {
-      const Floats y = all(static_cast<float>(part * kRows) - 0.5f * (kSquare - kRows));  // centre of the part
-      const Floats part_k0 = kParts == 1 ? k0 : fma(y, fma(y, float_yy, ky), k0);
-      const Floats part_kx = kParts == 1 ? kx : fma(y, float_xy, kx);
-      const Floats part_ky = kParts == 1 ? ky : fma(y + y, float_yy, ky);
-      const Floats rise_x = highest(part_kx, K, half_over, half_width);
-      const Floats rise_y = highest(part_ky, K, half_over, half_height);
-      e.visible |= bits(at_least(part_k0 + rise_x + rise_y, lowest)) << (part * kSquares + square);
-    }
+    const Floats rise = highest(kx, K, half_over, half_size) + highest(ky, K, half_over, half_size);
+    e.visible |= bits(at_least(k0 + rise, lowest)) << square;
   }
 }
 
-// Blends a splat; if asked to, keeps alphas and weights of the parts that it changes, and returns where the next go.
-template <bool kKeep, bool kDepth>
+// Blends a splat; if asked to, keeps alphas and weights of the squares that it may change, and returns where the next
+// go. Takes no shortcuts where alpha is 0, which would be hard to predict; `exp2_within` is out of its range there.
+template <bool kKeep, bool kColour, bool kDepth>
 float* blend_splat(const Exponents& e, const Limits& limits, Tile& tile, float* kept, uint32_t* touched) {
-  const Floats red = all(e.colour[0]), green = all(e.colour[1]), blue = all(e.colour[2]), depth = all(e.depth);
-  uint32_t changed = 0;
-  for (uint32_t rest = e.visible & tile.unfinished; rest; rest &= rest - 1) {
-    const int bit = __builtin_ctz(rest), square = bit % kSquares, lanes = bit / kSquares * kFloats;
-    const int place = square * kBlock + lanes;
-    const Floats x = load(kPositions.lane_x + lanes), y = load(kPositions.lane_y + lanes);
-    const Floats rest_of_sum = fma(all(e.y_slope[square]), y, load(e.bend + lanes) + all(e.constant[square]));
-    const Floats exponent = fma(all(e.x_slope[square]), x, rest_of_sum);
-    const Mask seen = at_least(exponent, all(limits.exponent));
-    if (!bits(seen)) continue;
-    const Floats alpha = keep(seen, smaller(exp2_within(exponent), all(kAlphaCap)));
-    const Floats before = load(tile.transmittance + place);
-    const Floats weight_if_going = before * alpha;
-    const Mask going = at_least(before - weight_if_going, all(limits.transmittance_min));
-    const Floats weight = keep(going, weight_if_going), after = negate_outside(going, before - weight);
-    store(tile.transmittance + place, after);
-    store(tile.colour[0] + place, fma(weight, red, load(tile.colour[0] + place)));
-    store(tile.colour[1] + place, fma(weight, green, load(tile.colour[1] + place)));
-    store(tile.colour[2] + place, fma(weight, blue, load(tile.colour[2] + place)));
-    if (kDepth) store(tile.depth + place, fma(weight, depth, load(tile.depth + place)));
-    if (kKeep) {
-      store(kept, keep(going, alpha));
-      store(kept + kFloats, weight);
-      kept += 2 * kFloats;
-      changed |= 1u << bit;
+  const Splat& s = *e.splat;
+  const Floats red = all(s.colour[0]), green = all(s.colour[1]), blue = all(s.colour[2]), depth = all(s.depth);
+  const Floats lowest = all(limits.exponent), transmittance_min = all(limits.transmittance_min), cap = all(kAlphaCap);
+  const uint32_t visible = e.visible & tile.unfinished;
+  for (uint32_t rest = visible; rest; rest &= rest - 1) {
+    const int square = __builtin_ctz(rest);
+    const Floats constant = all(e.constant[square]), x_slope = all(e.x_slope[square]), y_slope = all(e.y_slope[square]);
+    for (int lanes = 0; lanes < kBlock; lanes += kFloats) {
+      const int place = square * kBlock + lanes;
+      const Floats x = load(kPositions.lane_x + lanes), y = load(kPositions.lane_y + lanes);
+      const Floats exponent = fma(x_slope, x, fma(y_slope, y, load(e.bend + lanes) + constant));
+      const Floats alpha = keep(at_least(exponent, lowest), smaller(exp2_within(exponent), cap));
+      const Floats before = load(tile.transmittance + place), weight_if_going = before * alpha;
+      const Floats after = before - weight_if_going;
+      const Mask going = at_least(after, transmittance_min);
+      const Floats weight = keep(going, weight_if_going);
+      store(tile.transmittance + place, select(going, after, negative(before)));
+      if (kColour) {
+        store(tile.colour[0] + place, fma(weight, red, load(tile.colour[0] + place)));
+        store(tile.colour[1] + place, fma(weight, green, load(tile.colour[1] + place)));
+        store(tile.colour[2] + place, fma(weight, blue, load(tile.colour[2] + place)));
+      }
+      if (kDepth) store(tile.depth + place, fma(weight, depth, load(tile.depth + place)));
+      if (kKeep) {
+        store(kept + lanes, keep(going, alpha));
+        store(kept + kBlock + lanes, weight);
+      }
     }
+    if (kKeep) kept += 2 * kBlock;
   }
-  if (kKeep) *touched = changed;
+  if (kKeep) *touched = visible;
   return kept;
 }
 
@@ -204,7 +199,7 @@ struct Blended {
 };
 
 // Blends the splats of a tile, after `begin_tile`.
-template <bool kKeep, bool kDepth>
+template <bool kKeep, bool kColour, bool kDepth>
 Blended blend_tile(const Renderer& renderer, const Limits& limits, int index, Tile& tile, Scratch& scratch) {
   const Pair* pairs = renderer.pairs.data() + renderer.starts[index];
   const int count = renderer.starts[index + 1] - renderer.starts[index];
@@ -222,7 +217,7 @@ Blended blend_tile(const Renderer& renderer, const Limits& limits, int index, Ti
     if (kKeep) scratch.kept.reserve(kept + kBatch * kMostKept, kept);
     float* to = scratch.kept.data() + kept;
     uint32_t* touched = scratch.touched.data() + used;
-    for (int n = 0; n < size; n++) to = blend_splat<kKeep, kDepth>(batch[n], limits, tile, to, touched + n);
+    for (int n = 0; n < size; n++) to = blend_splat<kKeep, kColour, kDepth>(batch[n], limits, tile, to, touched + n);
     if (kKeep) kept = to - scratch.kept.data();
     used += size;
     update_unfinished(tile);
@@ -230,9 +225,9 @@ Blended blend_tile(const Renderer& renderer, const Limits& limits, int index, Ti
   return {pairs, count, used, scratch.kept.data() + kept};
 }
 
-// Calls function(splat, record, parts, kept) for the blended splats of a tile from back to front: parts has a bit for
-// each part that the splat changes, kept points to the end of its alphas and weights, and the function returns their
-// start; parts is 0 for splats that change nothing.
+// Calls function(splat, record, squares, kept) for the blended splats of a tile from back to front: squares has a bit
+// for each square that the splat may change, kept points to the end of its alphas and weights, and the function returns
+// their start.
 template <typename Function>
 void for_each_behind(const Renderer& renderer, const Blended& blended, const Scratch& scratch, Function&& function) {
   const float* kept = blended.kept;
@@ -242,21 +237,22 @@ void for_each_behind(const Renderer& renderer, const Blended& blended, const Scr
   }
 }
 
-// Sums of `kSums` values over the parts of a tile in which a splat changes pixels, from the last square to the first.
+// Sums of `kSums` values over the squares of a tile in which a splat may change pixels, from the last to the first.
 //
 // Calls function(place, alpha, weight, sums) for each part: `place` is that of its first pixel; the function adds to
 // `sums`. Writes the totals, and returns the start of the splat's alphas and weights.
 template <int kSums, typename Function>
-const float* sum_parts(uint32_t parts, const float* kept, float* totals, Function&& function) {
+const float* sum_squares(uint32_t squares, const float* kept, float* totals, Function&& function) {
   Floats sums[kSums][kParts];
-  for (int part = kParts - 1; part >= 0; part--) {
+  for (int part = 0; part < kParts; part++) {
+    const float* from = kept + part * kFloats;
     Floats own[kSums];
     for (Floats& sum : own) sum = all(0.0f);
-    for (uint32_t squares = parts >> (part * kSquares) & kAllSquares; squares;) {
-      const int square = 31 - __builtin_clz(squares);
-      squares ^= 1u << square;
-      kept -= 2 * kFloats;
-      function(square * kBlock + part * kFloats, load(kept), load(kept + kFloats), own);
+    for (uint32_t rest = squares; rest;) {
+      const int square = 31 - __builtin_clz(rest);
+      rest ^= 1u << square;
+      from -= 2 * kBlock;
+      function(square * kBlock + part * kFloats, load(from), load(from + kBlock), own);
     }
     for (int n = 0; n < kSums; n++) sums[n][part] = own[n];
   }
@@ -265,7 +261,7 @@ const float* sum_parts(uint32_t parts, const float* kept, float* totals, Functio
   int n = 0;
   for (; n + 8 <= kSums; n += 8) store(totals + n, sum_lanes(folded + n));
   for (; n < kSums; n++) totals[n] = sum_lanes(folded[n]);
-  return kept;
+  return kept - 2 * kBlock * __builtin_popcount(squares);
 }
 
 }  // namespace csplat

@@ -1,7 +1,7 @@
 // The gradient of a loss with respect to the splats, and a step of Adam along it.
 //
-// Blending, back to front; parallel over tiles. With g the gradient of the loss at a pixel and `behind` the part of g·colour
-// due to all farther splats and the background, per unit of transmittance:
+// Blending, back to front; parallel over tiles. With g the gradient of the loss at a pixel and `behind` the part of
+// g·colour due to all farther splats and the background, per unit of transmittance:
 //
 //     slope = ∂loss/∂exponent = w (g·c − behind), and 0 if alpha is capped
 //     behind ← behind + alpha (g·c − behind)
@@ -97,31 +97,34 @@ double compare(const View& view, const float* reference, const Tile& tile, Slope
 
 // Sums the gradients of a splat over the pixels of a tile, and returns the start of its alphas and weights.
 template <bool kDepth>
-const float* sum_gradients(const Splat& s, Slopes& slopes, const float* kept, uint32_t parts, float* record) {
-  const Floats cap = all(kAlphaCap), red = all(s.colour[0]), green = all(s.colour[1]), blue = all(s.colour[2]);
+const float* sum_gradients(const Splat& s, Slopes& slopes, const float* kept, uint32_t squares, float* record) {
+  const Floats cap = all(kAlphaCap), colour[3] = {all(s.colour[0]), all(s.colour[1]), all(s.colour[2])};
   const Floats depth = all(s.depth);
   if (!kDepth) record[9] = 0.0f;
-  return sum_parts<kDepth ? 10 : 9>(parts, kept, record, [&](int place, Floats alpha, Floats weight, Floats* sums) {
-    const Floats behind = load(slopes.behind + place), g0 = load(slopes.colour[0] + place);
-    const Floats g1 = load(slopes.colour[1] + place), g2 = load(slopes.colour[2] + place);
-    Floats step = fma(g0, red, fma(g1, green, fma(g2, blue, -behind)));
+  return sum_squares<kDepth ? 10 : 9>(squares, kept, record, [&](int place, Floats alpha, Floats weight, Floats* sums) {
+    // In an order that needs few registers: AVX2 has 16.
+    const Floats behind = load(slopes.behind + place);
+    Floats step = -behind;
+    for (int c = 2; c >= 0; c--) {
+      const Floats slope = load(slopes.colour[c] + place);
+      step = fma(slope, colour[c], step);
+      sums[6 + c] = fma(weight, slope, sums[6 + c]);
+    }
     if (kDepth) {
-      const Floats g3 = load(slopes.depth + place);
-      step = fma(g3, depth, step);
-      sums[9] = fma(weight, g3, sums[9]);
+      const Floats slope = load(slopes.depth + place);
+      step = fma(slope, depth, step);
+      sums[9] = fma(weight, slope, sums[9]);
     }
     store(slopes.behind + place, fma(alpha, step, behind));
     const Floats slope = drop(at_least(alpha, cap), weight * step);
-    const Floats x = load(kPositions.x + place), y = load(kPositions.y + place), sx = slope * x, sy = slope * y;
     sums[0] = sums[0] + slope;
+    const Floats x = load(kPositions.x + place), sx = slope * x;
     sums[1] = sums[1] + sx;
-    sums[2] = sums[2] + sy;
     sums[3] = fma(sx, x, sums[3]);
+    const Floats y = load(kPositions.y + place), sy = slope * y;
     sums[4] = fma(sx, y, sums[4]);
+    sums[2] = sums[2] + sy;
     sums[5] = fma(sy, y, sums[5]);
-    sums[6] = fma(weight, g0, sums[6]);
-    sums[7] = fma(weight, g1, sums[7]);
-    sums[8] = fma(weight, g2, sums[8]);
   });
 }
 
@@ -132,15 +135,16 @@ double tile_gradients(Renderer& renderer, const View& view, const ImageGradients
   Tile tile;
   Slopes slopes;
   begin_tile(view, index, tile);
-  const Blended blended = blend_tile<true, false>(renderer, Limits(view), index, tile, scratch);
+  const auto blend = reference ? blend_tile<true, true, false> : blend_tile<true, false, false>;
+  const Blended blended = blend(renderer, Limits(view), index, tile, scratch);
   double error = 0.0;
   if (reference)
     error = compare(view, reference, tile, slopes);
   else
     load_slopes(view, image, tile, slopes);
-  for_each_behind(renderer, blended, scratch, [&](const Splat& s, int64_t record, uint32_t parts, const float* kept) {
+  for_each_behind(renderer, blended, scratch, [&](const Splat& s, int64_t record, uint32_t squares, const float* kept) {
     float* to = renderer.records.data() + kSums * record;
-    if (parts) return sum_gradients<kDepth>(s, slopes, kept, parts, to);
+    if (squares) return sum_gradients<kDepth>(s, slopes, kept, squares, to);
     std::memset(to, 0, kSums * sizeof(float));
     return kept;
   });
@@ -237,7 +241,8 @@ void shape_gradients(const Splats& splats, const View& view, const float* values
   Doubles gp[3] = {zero, zero, zero}, gq[3] = {zero, zero, zero};
   for (int n = 0; n < 3; n++) {
     const Doubles du = fma(gA2, g.u[n], gB * g.v[n]), dv = fma(gC2, g.v[n], gB * g.u[n]);
-    const DoubleMask inside = above(all(kLogScaleLimit), magnitude(load_doubles(values + (kScale + n) * kBlock + lane)));
+    const Doubles log_scale = load_doubles(values + (kScale + n) * kBlock + lane);
+    const DoubleMask inside = above(all(kLogScaleLimit), magnitude(log_scale));
     give(kScale + n, both(drawn, inside), fma(du, g.u[n], dv * g.v[n]));
     const Doubles dus = du * g.s[n], dvs = dv * g.s[n];
     for (int m = 0; m < 3; m++) {
@@ -303,6 +308,8 @@ void block_gradients(const Renderer& renderer, const Splats& splats, const View&
   alignas(64) float values[kValues * kBlock], lanes[(kValues + 1) * kBlock], directions[3 * kBlock];
   alignas(64) double centres[3 * kBlock], over_distance[kBlock];
   alignas(64) float basis[kBasis * kBlock], weights[kBasis * kBlock];
+  const int row = 3 * static_cast<int>(splats.coefficients);
+  if (with_means) prefetch(splats.shN + row * first, row * count);
   load_block(splats, block, values);
   BlockSums sums;
   std::memset(&sums, 0, sizeof sums);
@@ -314,7 +321,6 @@ void block_gradients(const Renderer& renderer, const Splats& splats, const View&
     shape_gradients(splats, view, values, sums, lane, lanes, centres);
   view_directions(values, view.camera, directions, over_distance);
   block_basis(splats.degree, directions, basis);
-  const int row = 3 * static_cast<int>(splats.coefficients);
   std::memset(out.shN, 0, static_cast<size_t>(row) * kBlock * sizeof(float));
   std::memset(weights, 0, sizeof weights);
   for (int lane = 0; lane < kBlock; lane++) {
@@ -441,8 +447,8 @@ CSPLAT_API int64_t csplat_error_gradients(int64_t threads, Renderer* renderer, c
 
 // Makes a step of all groups along the gradient of half the squared error of a view, or along that of another loss.
 //
-// reference: [H, W, 3], after `csplat_project`; or null, and gradient: [H, W, 3], that of the loss with respect to the image,
-// after `csplat_render`. error: [1], written: the squared error. The values are those of `splats`.
+// reference: [H, W, 3], after `csplat_project`; or null, and gradient: [H, W, 3], that of the loss with respect to the
+// image, after `csplat_render`. error: [1], written: the squared error. The values are those of `splats`.
 CSPLAT_API int64_t csplat_step(int64_t threads, Renderer* renderer, const Splats* splats, const View* view,
                                const float* reference, const float* gradient, const Step* step, double* error) {
   return guarded([&]() -> int64_t {

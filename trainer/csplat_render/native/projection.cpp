@@ -127,6 +127,7 @@ int64_t project_block(Renderer& renderer, const Splats& splats, const View& view
                       float* radii, bool count_bad) {
   const int64_t first = block * kBlock;
   const int count = static_cast<int>(std::min<int64_t>(kBlock, splats.count - first)), higher = splats.higher();
+  const int64_t row = 3 * splats.coefficients;
   float* depths = renderer.depths.data() + first;
   int32_t* tile_counts = renderer.tile_counts.data() + first;
   alignas(64) float values[kValues * kBlock];
@@ -135,6 +136,7 @@ int64_t project_block(Renderer& renderer, const Splats& splats, const View& view
   unsigned drawn = 0, finite = 0;
   for (int lane = 0; lane < kBlock; lane += kDoubles) {
     const Drawn found = project_lanes(splats, values, view, log2_least, lane, lanes);
+    if (found.drawn && !drawn) prefetch(splats.shN + row * first, row * count);
     drawn |= found.drawn;
     finite |= found.finite;
   }
@@ -148,7 +150,7 @@ int64_t project_block(Renderer& renderer, const Splats& splats, const View& view
   if (count_bad)
     for (unsigned rest = real & finite & ~drawn; rest; rest &= rest - 1) {
       const int64_t i = first + __builtin_ctz(rest);
-      bad += !(all_finite(splats.sh0 + 3 * i, 3) && all_finite(splats.shN + 3 * splats.coefficients * i, 3 * higher));
+      bad += !(all_finite(splats.sh0 + 3 * i, 3) && all_finite(splats.shN + row * i, 3 * higher));
     }
   if (!drawn) return bad;
   alignas(64) float basis[kBasis * kBlock];
@@ -159,7 +161,7 @@ int64_t project_block(Renderer& renderer, const Splats& splats, const View& view
   for (; drawn; drawn &= drawn - 1) {
     const int lane = __builtin_ctz(drawn);
     const int64_t i = first + lane;
-    const float* sh = splats.shN + 3 * splats.coefficients * i;
+    const float* sh = splats.shN + row * i;
     float colour[3];
     for (int c = 0; c < 3; c++) colour[c] = std::fma(basis[lane], splats.sh0[3 * i + c], 0.5f);
     for (int k = 0; k < higher; k++)
@@ -202,8 +204,8 @@ CSPLAT_API void csplat_delete_renderer(Renderer* renderer) { delete renderer; }
 
 // Projects the splats of a view, and returns the number of pairs of splat and tile.
 //
-// radii: [N], or null, as in `RenderResult`. counts: [2], the number of drawn splats, and of splats with NaN or infinity;
-// or null.
+// radii: [N], or null, as in `RenderResult`. counts: [2], the number of drawn splats, and of splats with NaN or
+// infinity; or null.
 CSPLAT_API int64_t csplat_project(int64_t threads, Renderer* renderer, const Splats* splats, const View* view,
                                   float* radii, int64_t* counts) {
   return guarded([&]() -> int64_t {

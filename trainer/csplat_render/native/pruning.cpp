@@ -1,8 +1,8 @@
 // The squared change of a render without each splat; parallel over tiles.
 //
-// At a pixel, a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour and B the
-// colour blended from everything behind it, background included, as seen directly behind the splat. Without the splat
-// the pixel changes by
+// At a pixel, a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour and B
+// the colour blended from everything behind it, background included, as seen directly behind the splat. Without the
+// splat the pixel changes by
 //
 //     d = w·(B − C),
 //
@@ -22,7 +22,7 @@ constexpr float kMaxColour = 1e15f; // so that squares of differences, summed ov
 void measure_tile(Renderer& renderer, const View& view, int index, float* rgb, Scratch& scratch) {
   Tile tile;
   begin_tile(view, index, tile);
-  const Blended blended = blend_tile<true, false>(renderer, Limits(view), index, tile, scratch);
+  const Blended blended = blend_tile<true, true, false>(renderer, Limits(view), index, tile, scratch);
   float background[3];
   for (int c = 0; c < 3; c++) background[c] = static_cast<float>(view.background[c]);
   for_each_pixel(tile, view, [&](size_t pixel, int place) {
@@ -30,10 +30,10 @@ void measure_tile(Renderer& renderer, const View& view, int index, float* rgb, S
     for (int c = 0; c < 3; c++) rgb[3 * pixel + c] = std::fma(left, background[c], tile.colour[c][place]);
   });
   for (int c = 0; c < 3; c++) std::fill(tile.colour[c], tile.colour[c] + kTilePixels, background[c]);
-  for_each_behind(renderer, blended, scratch, [&](const Splat& s, int64_t record, uint32_t parts, const float* kept) {
+  for_each_behind(renderer, blended, scratch, [&](const Splat& s, int64_t record, uint32_t squares, const float* kept) {
     Floats colour[3];
     for (int c = 0; c < 3; c++) colour[c] = all(std::min(s.colour[c], kMaxColour));
-    return sum_parts<kSums>(parts, kept, renderer.records.data() + kSums * record,
+    return sum_squares<kSums>(squares, kept, renderer.records.data() + kSums * record,
                             [&](int place, Floats alpha, Floats weight, Floats* sums) {
       Floats squares = all(0.0f);
       for (int c = 0; c < 3; c++) {

@@ -42,7 +42,7 @@ CSPLAT_API int64_t csplat_render(int64_t threads, Renderer* renderer, const View
       Scratch none;
       begin_tile(*view, static_cast<int>(index), tile);
       if (state) load_state(*view, state, tile);
-      blend_tile<false, true>(*renderer, limits, static_cast<int>(index), tile, none);
+      blend_tile<false, true, true>(*renderer, limits, static_cast<int>(index), tile, none);
       if (state) store_state(*view, tile, state);
       for_each_pixel(tile, *view, [&](size_t pixel, int place) {
         const float left = std::fabs(tile.transmittance[place]);

@@ -48,7 +48,8 @@ struct Group {
   double rate;  // learning rate, divided by 1 − β1^step
 };
 
-// A step of Adam, also for splats that the view does not show, whose gradients are 0. Mirrored by `_Step` in rasteriser.py.
+// A step of Adam, also for splats that the view does not show, whose gradients are 0. Mirrored by `_Step` in
+// rasteriser.py.
 struct Step {
   Group groups[6];  // means, quats, scales, logits, sh0, shN; means and shN may be null, they are then not fitted
   double over_root, beta2;      // 1 / √(1 − β2^step), β2
@@ -118,7 +119,7 @@ struct Pair { int32_t splat, record; };
 // Alphas and weights that blending keeps for a pass from back to front; one for each thread.
 struct Scratch {
   Array<float> kept;
-  Array<uint32_t> touched;  // a bit for each part of a tile that a splat changes
+  Array<uint32_t> touched;  // a bit for each square of a tile that a splat may change
 };
 
 struct Renderer {
@@ -142,6 +143,11 @@ struct Renderer {
     if (static_cast<int64_t>(scratch.size()) < threads) scratch.resize(threads);
   }
 };
+
+// Fetches values that will be needed soon, where the processor does not see by itself which these are.
+inline void prefetch(const float* values, int64_t count) {
+  for (int64_t n = 0; n < count; n += kBlock) __builtin_prefetch(values + n);
+}
 
 // Calls function(block) for all blocks, 16 adjacent blocks at a time.
 template <typename Function>

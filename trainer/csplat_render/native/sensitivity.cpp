@@ -1,8 +1,8 @@
 // Sums over the pixels of a view of the derivatives of its render with respect to each splat; the equations are at the
 // top of csplat_trainer.sensitivity.
 //
-// The passes: coefficients of h and C, by splat; sums over the pixels of each pair of splat and tile, back to front, which
-// give the light behind a splat; sums over the tiles of each splat.
+// The passes: coefficients of h and C, by splat; sums over the pixels of each pair of splat and tile, back to front,
+// which give the light behind a splat; sums over the tiles of each splat.
 #include "blending.h"
 #include "geometry.h"
 #include "harmonics.h"
@@ -55,7 +55,7 @@ void block_forms(const Renderer& renderer, const Splats& splats, const View& vie
 void measure_tile(Renderer& renderer, const View& view, const double* forms, int index, Scratch& scratch) {
   Tile tile;
   begin_tile(view, index, tile);
-  const Blended blended = blend_tile<true, false>(renderer, Limits(view), index, tile, scratch);
+  const Blended blended = blend_tile<true, false, false>(renderer, Limits(view), index, tile, scratch);
   for (int c = 0; c < 3; c++)
     std::fill(tile.colour[c], tile.colour[c] + kTilePixels, static_cast<float>(view.background[c]));
   const double x0 = tile.left + 0.5 * kTile, y0 = tile.top + 0.5 * kTile;
@@ -76,7 +76,8 @@ void measure_tile(Renderer& renderer, const View& view, const double* forms, int
       hy[k] = all(static_cast<float>(form[2 * k + 1]));
     }
     for (int e = 0; e < 6; e++) base[e] = all(static_cast<float>(form[6 + e]));
-    kept = sum_parts<kSums>(scratch.touched[n], kept, record, [&](int place, Floats alpha, Floats weight, Floats* sums) {
+    const uint32_t squares = scratch.touched[n];
+    kept = sum_squares<kSums>(squares, kept, record, [&](int place, Floats alpha, Floats weight, Floats* sums) {
       Floats slope = zero, size = zero, square = zero;
       for (int c = 0; c < 3; c++) {
         const Floats behind = load(tile.colour[c] + place), change = all(s.colour[c]) - behind;
@@ -180,13 +181,13 @@ using namespace csplat;
 
 // Adds the derivatives of a view, after `csplat_project` of the same splats.
 //
-// forms: [N, 12], scratch. The other arrays are incremented:
-// colour: [N, B, 3], |derivative of the render's sum by a coefficient|; null if this and the next two are not requested.
-// net: [N, 7], the same for alpha and the six entries of the covariance over its trace. sizes: [N, 7], the same with
-// magnitudes taken per pixel and channel. squares: [N, 3], squared derivatives of the pixels' channels by a colour (one
-// channel), alpha, and the centre. metric: [N, B (B + 1) / 2], squared derivatives by SH coefficients of one channel, the
-// upper triangle of a matrix; or null. shape_matrices: [N, 21], squared derivatives of all channels by the covariance
-// over its trace, the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz. views: [N], by 1 for splats seen.
+// forms: [N, 12], scratch. The other arrays are incremented: colour: [N, B, 3], |derivative of the render's sum by a
+// coefficient|; null if this and the next two are not requested. net: [N, 7], the same for alpha and the six entries of
+// the covariance over its trace. sizes: [N, 7], the same with magnitudes taken per pixel and channel. squares: [N, 3],
+// squared derivatives of the pixels' channels by a colour (one channel), alpha, and the centre. metric: [N, B (B + 1) /
+// 2], squared derivatives by SH coefficients of one channel, the upper triangle of a matrix; or null. shape_matrices:
+// [N, 21], squared derivatives of all channels by the covariance over its trace, the upper triangle of a matrix over
+// xx, yy, zz, √2 xy, √2 xz, √2 yz. views: [N], by 1 for splats seen.
 CSPLAT_API int64_t csplat_add_derivatives(int64_t threads, Renderer* renderer, const Splats* splats, const View* view,
                                           double* forms, float* colour, double* net, double* sizes, double* squares,
                                           float* metric, double* shape_matrices, int64_t* views) {

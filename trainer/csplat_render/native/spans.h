@@ -23,24 +23,29 @@ inline void for_each_span(const Splat& splat, const Extent& e, Function&& functi
     for (int row = top; row < bottom; row++) function(row, first, last);
     return;
   }
-  for (int row = top; row < bottom; row++) {
-    const double low = std::max(row * kTile, e.top) + 0.5 - splat.y;
-    const double high = std::min(row * kTile + kTile, e.bottom) - 0.5 - splat.y;
-    const auto end_of_chord = [&](double height_of_point, double sign) {
-      const double dy = std::min(std::max(height_of_point, low), high);
-      const double t = 1.0 - (dy * e.flatness) * (dy * e.flatness);
-      return dy * e.slope + sign * e.half_width * std::sqrt(std::max(t, 0.0));
+  static constexpr double kNumbers[kDoubles] = {0.0, 1.0, 2.0, 3.0};
+  const Doubles zero = all(0.0), half = all(0.5), one = all(1.0), y = all(splat.y), over_tile = all(1.0 / kTile);
+  const Doubles leftmost = all(static_cast<double>(first)), rightmost = all(last - 1.0);
+  for (int row = top; row < bottom; row += kDoubles) {
+    const Doubles row_top = all(static_cast<double>(kTile)) * (all(static_cast<double>(row)) + load(kNumbers));
+    const Doubles row_bottom = row_top + all(static_cast<double>(kTile));
+    const Doubles low = larger(row_top, all(static_cast<double>(e.top))) + half - y;
+    const Doubles high = smaller(row_bottom, all(static_cast<double>(e.bottom))) - half - y;
+    const auto end_of_chord = [&](double height_of_point, double half_width) {  // NaN stays
+      const Doubles dy = smaller(high, larger(low, all(height_of_point))), across = dy * all(e.flatness);
+      return dy * all(e.slope) + all(half_width) * square_root(larger(zero, one - across * across));
     };
-    const double right = end_of_chord(e.widest, 1.0), left = end_of_chord(-e.widest, -1.0);
-    if (!(left <= right)) {
-      function(row, first, last);  // NaN by overflow: use the box
-      continue;
-    }
+    const Doubles right = end_of_chord(e.widest, e.half_width), left = end_of_chord(-e.widest, -e.half_width);
+    const DoubleMask valid = at_least(right, left);  // false for NaN by overflow: use the box
     // Pixel centres are at least half a pixel inside a tile, which leaves a margin for rounding.
-    const double x0 = (splat.x + left) / kTile, x1 = (splat.x + right) / kTile;
-    const int begin = x0 < first ? first : x0 > last ? last : static_cast<int>(x0);
-    const int end = x1 > last - 1 ? last : (x1 < first ? first : static_cast<int>(x1)) + 1;
-    if (begin < end) function(row, begin, end);
+    const Doubles x0 = larger((all(splat.x) + left) * over_tile, leftmost), x1 = (all(splat.x) + right) * over_tile;
+    double begins[kDoubles], ends[kDoubles];
+    store(begins, select(valid, smaller(x0, rightmost + one), leftmost));
+    store(ends, select(valid, smaller(larger(x1, leftmost), rightmost), rightmost));
+    for (int n = 0; n < kDoubles && row + n < bottom; n++) {
+      const int begin = static_cast<int>(begins[n]), end = static_cast<int>(ends[n]) + 1;
+      if (begin < end) function(row + n, begin, end);
+    }
   }
 }
 

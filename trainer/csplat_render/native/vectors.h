@@ -3,7 +3,8 @@
 // Data is laid out in blocks of 16 lanes. A block is one AVX-512 register of floats, two AVX2 registers, or four NEON
 // registers, which are used in pairs. Every operation works on each lane alone and rounds as IEEE 754 requires, and
 // sums across lanes have one order. Products are fused with sums only by `fma` and `fnma`: compile with
-// -ffp-contract=off. `smaller` and `larger` return b if one of the values is NaN; `fma` returns a b + c, `fnma` c − a b.
+// -ffp-contract=off. `smaller` and `larger` return b if one of the values is NaN; `fma` returns a b + c, `fnma` c − a
+// b.
 #pragma once
 
 #include <cstdint>

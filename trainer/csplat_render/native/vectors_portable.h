@@ -85,6 +85,7 @@ inline Doubles floor(Doubles a) {
 inline double first_lane(Doubles a) { return a.v[0]; }
 
 inline Mask at_least(Floats a, Floats b) { return {a.v >= b.v}; }
+inline Floats select(Mask m, Floats a, Floats b) { return {m.v ? a.v : b.v}; }
 inline IntVector float_bits(Floats a) { return reinterpret_cast<IntVector>(a.v); }
 inline Floats from_bits(IntVector a) { return {reinterpret_cast<FloatVector>(a)}; }
 inline Floats keep(Mask m, Floats a) { return from_bits(m.v & float_bits(a)); }
@@ -97,7 +98,7 @@ inline unsigned bits(Mask m) {
   return result;
 }
 inline unsigned negative_lanes(Floats a) { return bits(Mask{float_bits(a) < 0}); }
-inline Floats negate_outside(Mask m, Floats a) { return from_bits(float_bits(a) | (~m.v & INT32_MIN)); }
+inline Floats negative(Floats a) { return from_bits(float_bits(a) | INT32_MIN); }  // −|a|
 inline Floats sign_of(Floats b, Floats a) {
   return {b.v != 0.0f ? from_bits(float_bits(a) | (float_bits(b) & INT32_MIN)).v : b.v};
 }

@@ -50,6 +50,7 @@ struct Eights { __m256 v; };
 CSPLAT_ARITHMETIC(Floats, float, CSPLAT_PS)
 CSPLAT_ARITHMETIC(Doubles, double, CSPLAT_PD)
 
+inline Floats negative(Floats a) { return {CSPLAT_PS(or)(a.v, CSPLAT_PS(set1)(-0.0f))}; }  // −|a|
 inline DoubleMask at_least(Doubles a, Doubles b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_GE_OQ)}; }
 inline DoubleMask above(Doubles a, Doubles b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_GT_OQ)}; }
 inline DoubleMask both(DoubleMask a, DoubleMask b) { return {_mm256_and_pd(a.v, b.v)}; }
@@ -67,14 +68,11 @@ inline void store(float* p, Eights a) { _mm256_storeu_ps(p, a.v); }
 #ifdef __AVX512F__
 
 inline Mask at_least(Floats a, Floats b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
+inline Floats select(Mask m, Floats a, Floats b) { return {_mm512_mask_blend_ps(m, b.v, a.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm512_maskz_mov_ps(m, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm512_maskz_mov_ps(static_cast<Mask>(~m), a.v)}; }
 inline unsigned bits(Mask m) { return m; }
 inline unsigned negative_lanes(Floats a) { return _mm512_movepi32_mask(_mm512_castps_si512(a.v)); }
-// Returns a with a negative sign in the lanes that are not in m.
-inline Floats negate_outside(Mask m, Floats a) {
-  return {_mm512_mask_or_ps(a.v, static_cast<Mask>(~m), a.v, _mm512_set1_ps(-0.0f))};
-}
 // Returns a with the sign of b, or b if that is 0.
 inline Floats sign_of(Floats b, Floats a) {
   const Mask some = _mm512_cmp_ps_mask(b.v, _mm512_setzero_ps(), _CMP_NEQ_UQ);
@@ -100,13 +98,11 @@ inline Eights fold(const Floats* parts) {
 #else
 
 inline Mask at_least(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
+inline Floats select(Mask m, Floats a, Floats b) { return {_mm256_blendv_ps(b.v, a.v, m.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm256_and_ps(m.v, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm256_andnot_ps(m.v, a.v)}; }
 inline unsigned bits(Mask m) { return static_cast<unsigned>(_mm256_movemask_ps(m.v)); }
 inline unsigned negative_lanes(Floats a) { return static_cast<unsigned>(_mm256_movemask_ps(a.v)); }
-inline Floats negate_outside(Mask m, Floats a) {
-  return {_mm256_or_ps(a.v, _mm256_andnot_ps(m.v, _mm256_set1_ps(-0.0f)))};
-}
 inline Floats sign_of(Floats b, Floats a) {
   const __m256 some = _mm256_cmp_ps(b.v, _mm256_setzero_ps(), _CMP_NEQ_UQ);
   const __m256 sign = _mm256_and_ps(b.v, _mm256_set1_ps(-0.0f));
