@@ -8,6 +8,7 @@ import pytest
 from captures import cameras, shell, training_images
 from gsplat_twin import rasterization
 from models import with_facts
+from oracle import facing
 
 from csplat import EncodeOptions, Target
 from csplat.errors import InputError
@@ -34,9 +35,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat nee
 
 @pytest.fixture
 def camera() -> Camera:
-    viewmat = np.eye(4)
-    viewmat[2, 3] = 6.0
-    return Camera(np.array([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), viewmat, 24, 20)
+    return facing(focal=30.0, distance=6.0, width=24, height=20)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from captures import photograph_object, shell, training_images
 from command_line import call
+from oracle import facing
 from train_cases import QUICK
 
 from csplat.errors import InputError
@@ -37,9 +38,7 @@ CPU, BLACK = torch.device("cpu"), np.zeros(3, np.float32)
 
 @pytest.fixture
 def camera() -> Camera:
-    viewmat = np.eye(4)
-    viewmat[2, 3] = 6.0
-    return Camera(np.array([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), viewmat, 24, 20)
+    return facing(focal=30.0, distance=6.0, width=24, height=20)
 
 
 @pytest.fixture

@@ -168,7 +168,7 @@ def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel
             error = np.einsum("cyx,cyx->yx", images[:4], images[:4])
             squares[size] += float(np.sum(error[covered], dtype=np.float64)) / 4.0  # channels
             pixels[size] += int(covered.sum())
-            images = _halved(images)  # for the next coarser size
+            images = _halved(images)  # the next coarser size
     return squares / np.maximum(pixels, 1)
 
 

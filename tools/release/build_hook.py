@@ -16,7 +16,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 _MODES = ("auto", "require", "off")
 _SOURCES = "trainer/csplat_render/native"
-_TARGET = "csplat_render/native"  # in the wheel
+_TARGET = "csplat_render/native"  # the folder of the libraries in a wheel
 
 
 class NativeBuildHook(BuildHookInterface):

@@ -1,4 +1,4 @@
-"""What depends on the device: measurements, exact on the CPU or estimated on a GPU, and the rasteriser for torch."""
+"""Measure splats exactly on the CPU, or estimate on a GPU; make the rasteriser that torch uses on a device."""
 
 from __future__ import annotations
 

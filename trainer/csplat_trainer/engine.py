@@ -88,7 +88,7 @@ class CpuEngine:
         self._rasteriser = Rasteriser(context=self._context)
         self._losses = SizedLosses(options.loss)
         self._normals = np.empty((0, 3), np.float32)
-        self._radii = np.empty(0, np.float32)  # of the last render
+        self._radii = np.empty(0, np.float32)  # [N], radii in the last render, pixels
 
     def step(
         self,

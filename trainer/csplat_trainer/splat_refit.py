@@ -41,7 +41,7 @@ _RATE_EXPONENT = 0.07 * 10.0 / math.log(10.0)  # k of bytes ∝ error^-k, for 7 
 _LEAST_QUANTISED = 0.1  # least fraction of a file's error that is attributed to quantisation
 _CENTRE_BITS = 24.0  # typical bits of a splat's centre, which is fixed
 _SIZE_LIMIT = 60.0  # largest logarithm of a size, so that exponentials stay finite
-_CELLS = float(2**20 - 1)  # of the curve along which splats are sorted, per axis
+_CELLS = float(2**20 - 1)  # cells per axis of the Morton curve along which splats are sorted
 _SAMPLE = 8  # every Nth view is rendered to measure the error
 
 

@@ -310,7 +310,7 @@ _LAYOUTS = {
 
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?$")
 _ID_DIGITS = 20  # digits of the longest id or size; COLMAP counts in 64 bits
-_POSE_WORDS = 10  # in a line of images.txt: id, rotation (4), translation (3), camera, name, which may have spaces
+_POSE_WORDS = 10  # words of a line of images.txt: id, rotation (4), translation (3), camera, name (may have spaces)
 _WORD_SHOWN_MAX = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 

@@ -66,7 +66,7 @@ def measure_kernels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Meas
 
 @dataclass(eq=False)
 class _Inputs:
-    """What is rendered and fitted, made at first use.
+    """The inputs of all works; each is made at first use.
 
     Attributes:
         model: the scene.
