@@ -141,11 +141,11 @@ class AnalyticScene:
         removed = self.removed(contents.splats, refitted=contents.refitted)
         return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
 
-    def source_error(self, splats, sh_degree, views, *, refitted=False):
+    def source_error(self, splats, sh_degree, views, *, refitted=0.0):
         return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
 
     def removed(self, splats, *, refitted):
-        """Return the error of removal if this number of splats is kept."""
+        """Return the error of removal if this number of splats is kept; `refitted` is the part of the gain, 0 to 1."""
         needed = self.splats - self.unneeded
         gone = np.maximum(0, needed - splats) / (0.5 * needed)
         return error_of(self.removal_psnr + self.mended * refitted) * gone**self.removal_power
@@ -242,9 +242,12 @@ class _Judge:
             self.scored.append(model)
             error = self.scene.error_of(model.contents, self.views)
         else:
-            refitted = bool(model.sh0.any())  # marks the splats of `_Removal.refit`
+            refitted = float(model.sh0.max(initial=0.0))  # set by `_Removal.refit`
             error = self.scene.source_error(len(model), model.sh_degree, self.views, refitted=refitted)
         return np.full(len(self.cameras), error)
+
+    def every(self, step):
+        return replace(self, cameras=self.cameras[::step])
 
     def pooled(self, errors):
         return float(np.mean(errors))
@@ -299,8 +302,10 @@ class _Removal(Pruner):
     def order(self):
         return _Order(self.scene)
 
-    def refit(self, kept_count):
+    def refit(self, kept_count, part=1.0):
         model = self.source.select(self.order.kept(kept_count))
-        model = replace(model, sh0=np.ones_like(model.sh0))
+        gain = self.scene.mended
+        refitted = (gain - 1.5 * (part == 0.25)) / gain  # another refit gains 1.5 dB after a brief one
+        model = replace(model, sh0=np.full_like(model.sh0, refitted))
         how = {"classifiable": self.use_classes, "file_seconds": self.scene.file_seconds}
         return _Splats(self.scene, model, refits=True, **how)

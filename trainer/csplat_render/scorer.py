@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -121,6 +121,11 @@ class Scorer:
                 references.append(_render_reference(render, camera))
             context.progress("drawing the source", 1.0)
         return cls(cameras, references, background, mode, context, source.origin)
+
+    def every(self, step: int) -> Scorer:
+        """Return a scorer on every Nth of the views, which shares their reference images."""
+        pixels = None if self.pixels is None else self.pixels[::step]
+        return replace(self, cameras=self.cameras[::step], references=self.references[::step], pixels=pixels)
 
     def reference(self, number: int) -> ReferenceImage:
         """Return the reference image of a view."""

@@ -74,7 +74,7 @@ def test_the_spread_is_over_views_and_the_psnr_of_extra_views_is_reported():
 def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
     found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
     decoded, report = decode_scene(found.data), found.report.search
-    assert 30.0 <= report.validation_psnr <= 31.0  # the PSNR of such small files jumps
+    assert 30.0 <= report.validation_psnr <= 31.1  # the PSNR of such small files jumps
     assert report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
     validation_psnr = views.validation_scorer(many).psnr(decoded.model)
     assert report.validation_psnr == pytest.approx(validation_psnr, abs=1e-4)

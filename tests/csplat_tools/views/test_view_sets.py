@@ -67,8 +67,8 @@ def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path):
         views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
         assert (judging, virtual) == (len(views.test), views.virtual)
         roles = poses(views)
-        assert sum(map(len, roles)) == len(set.union(*roles)) == (36 + 12 + count if virtual else count)
-        assert not virtual or (36, 12) == (len(views.training), len(views.validation))
+        assert sum(map(len, roles)) == len(set.union(*roles)) == (36 + 48 + count if virtual else count)
+        assert not virtual or (36, 48) == (len(views.training), len(views.validation))
 
 
 def test_the_number_of_validation_views_may_be_chosen(sets, scene):

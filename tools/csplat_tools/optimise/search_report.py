@@ -104,11 +104,7 @@ def make_report(
         spread=None if math.isnan(spread) else round(spread, 3),
         views=len(errors),
         views_of=views_of,
-        renders=sum(
-            len(candidates.validation_scorer.cameras) * (1 + (candidate.image_error is not None))
-            for candidate in candidates.made
-        )
-        + len(errors),
+        renders=candidates.renders + len(errors),
         chosen=found.as_json(),
         tried=tuple(candidate.as_json() for candidate in candidates.made),
         why=(*_explain_choice(target, found, candidates, splats_before), *remarks),

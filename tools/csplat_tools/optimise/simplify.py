@@ -18,14 +18,14 @@ from csplat.model import SplatModel
 from csplat.types import I64
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import psnr_of_mse
-from csplat_tools.optimise.pruning import PrunedSubset, Pruner
+from csplat_tools.optimise.pruning import REFITS, PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import AIM, LOG_ERROR_PER_DB, NOTHING, error_of_psnr
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
-_TRIES = 4  # largest number of refits in the search for the fewest splats of a PSNR
-_NOT_PRUNED = f"none of up to {_TRIES} pruned scenes reached the target: all splats are kept, unchanged"
+_TRIES = 4  # largest number of refits that correct the number of splats for a PSNR
+_NOT_PRUNED = "none of some pruned scenes reached the target: all splats are kept, unchanged"
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
     """Return the fewest splats that reach a PSNR on validation views, and their PSNR for the report, dB.
 
     For a drop, the PSNR is against images, otherwise against renders of the source. Each number is predicted from the
-    pruning order and the last refit. All splats are kept, without a refit, if none of up to `_TRIES` refits reaches it.
+    pruning order and the last refit. All splats are kept, without a refit, if no refit reaches it.
 
     Raises:
         InputError: even the source misses the PSNR.
@@ -176,9 +176,10 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
     allowed = error_of_psnr(goal)
     added_max = allowed - source_error  # largest mean squared error that pruning may add
     refits = list[tuple[float, PrunedSubset]]()  # with the mean squared error
-    last: tuple[int, float] | None = None  # number of splats of the last refit, and the error that it added
+    known: tuple[int, float] | None = None  # number of splats of the last refit, and the error that another would add
+    schedule = list(REFITS) if pruner.refits else []
     while True:
-        counts, errors = (values[::-1] for values in pruner.errors(added_max, last))  # np.interp needs ascending counts
+        counts, errors = (values[::-1] for values in pruner.errors(added_max, known))  # np.interp: ascending counts
         kept_count = next_value(
             math.log(added_max),
             [(len(subset.rows), math.log(max(error - source_error, NOTHING))) for error, subset in refits],
@@ -188,10 +189,12 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
         )  # fmt: skip
         if kept_count is None or math.ceil(kept_count) == len(source):
             break
-        subset = pruner.refit(math.ceil(kept_count))
+        part, rest_gain = schedule.pop(0) if schedule else REFITS[-1]
+        subset = pruner.refit(math.ceil(kept_count), part)
         error = scorer.pooled(scorer.errors(subset.model))
-        refits.append((error, subset))
-        last = len(subset.rows), max(error - source_error, 0.0)
+        known = len(subset.rows), error_of_psnr(rest_gain) * max(error - source_error, 0.0)
+        if part == REFITS[-1][0] or not pruner.refits:  # others gain more than this one would
+            refits.append((error, subset))
     reached = [refit for refit in refits if refit[0] <= allowed] or [(source_error, pruner.refit(len(source)))]
     error, subset = min(reached, key=lambda refit: len(refit[1].rows))
     return subset, {"validation_psnr": psnr_of_mse(error)}

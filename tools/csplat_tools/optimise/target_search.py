@@ -4,24 +4,21 @@ How a target is met:
 
 1. A size that no file of the scene needs, and a PSNR that none reaches, are recognised by one file (`finest`).
 2. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
-   gives the first number of splats; for a size, typical bytes per splat do (`_first_count`). These splats are refitted
-   to renders of the source.
-3. Drafts of these splats, which are files without a refit through their quantisers, are encoded with a coding of SH of
-   each kind. They give its bytes and error as functions of the precision (`RateLine`), and so its bytes on the goal
-   (`_predict`).
-4. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
-   save enough for its time (`_is_worth`), it is tried as well (`_next_count`). For a PSNR or a drop, splats whose
-   pruning takes too much of the error get no drafts, unless they are the last. For the final number, and for a size,
-   drafts of one coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
-5. Files of the best splats and coding are made, with a refit through their quantisers. Each corrects the prediction of
-   the precision, until another file is not expected to save enough (`_make_files`). If no file meets the goal, larger
-   subsets of step 4 are taken, then other numbers of splats (fewer for a size). Of all files that meet it, drafts
+   gives the first number of splats; for a size, typical bytes per splat do. These splats are refitted to renders of the
+   source, in few steps. Their measured error corrects the prediction, until a whole refit confirms the number
+   (`_choose_splats`).
+3. Drafts of the refitted splats, which are files without a refit through their quantisers, are encoded with a coding of
+   SH of each kind, then with each neighbour of the best, up to `_TRIES` codings (`_choose_coding`). They give bytes and
+   error as functions of the precision (`RateLine`), and so the bytes on the goal (`_predict`).
+4. Files of these splats and the best coding are made, with a refit through their quantisers. Each corrects the
+   prediction of the precision, until another file is not expected to save enough (`_make_files`). If no file meets the
+   goal, other numbers of splats are taken, more for a PSNR and fewer for a size. Of all files that meet it, drafts
    included, the smallest is written, or the best file of a size.
 
-All errors are measured on validation views; test views only score the written file. Errors are against renders of the
-source. For a drop, files are measured against the validation images, too, which tells how much error against renders
-is allowed (`_allowed`). With all splats kept, steps 2 and 4 are left out, and the presets' own files are candidates
-unless the best has quantisation classes.
+All errors are measured on validation views, those of drafts on a few of them (`CandidatePool`); test views only score
+the written file. Errors are against renders of the source. For a drop, files are measured against the validation
+images, too, which tells how much error against renders is allowed (`_allowed`). With all splats kept, step 2 is left
+out, and the presets' own files are candidates unless the best has quantisation classes.
 """
 
 from __future__ import annotations
@@ -47,7 +44,7 @@ from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
-from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
+from csplat_tools.optimise.pruning import REFITS, Pruner
 from csplat_tools.optimise.rate_distortion import (
     AIM,
     APART,
@@ -76,26 +73,23 @@ _PRUNING_RENDERS = 2480.0  # pruning at the default effort
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
 _USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
-_MISSED_GAIN = 0.03  # log bytes that the refit of a file gains less without quantisation classes (horse, plane3: 4 %)
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 
 # Range and number of the candidates.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
 _FINEST = 80.0  # dB of precision; from 70 dB on, opacities and quats have all their levels, and finer means cut tiles
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
-_HIGH, _BEYOND_REACH = 55.0, 3.0  # dB: a PSNR that may be out of reach; it is if the finest file misses it by more
+_HIGH = 55.0  # dB; a PSNR above it may be out of reach, which one file shows
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
-_ROUNDS = 3  # most rounds of the first prediction of the count, most splat counts, most drafts of one coding
+_FEW = 3  # most predictions of the count, brief refits, drafts of one coding, files that miss narrowly
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
 # Distances, and the worth of another candidate.
-_REFITS = 3  # files of pruned splats that miss a PSNR narrowly, before other splats are tried
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
 _LEAST_LEFT = 0.01  # least factor of a goal that is left for the file without levels
-_TOLERANCE = 1.1  # factor by which pruning may take more of the error than it should, before it takes too much
 _SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
@@ -174,20 +168,18 @@ class TargetSearch:
             if not (coding.use_classes and self.whole.classifiable):  # the presets' own files have no classes
                 self._try_presets(coding)
         else:
-            subset, coding, larger = self._choose_splats(self.pruner)
+            subset, coding = self._choose_splats(self.pruner)
             while not self._make_files(subset, coding):
-                if larger:
-                    subset, coding = larger.pop()
-                    continue
                 another = self.pruner.refit(self._count_beyond(len(subset.model)))
                 if len(another.model) == len(subset.model):
                     break
                 subset = another
                 self._draft_cost(subset, coding, {})
-        met = [candidate for candidate in self.pool.made if self._is_met(candidate)]
-        if not met:
-            raise InputError(self._unreached_message())
-        return min(met, key=lambda candidate: candidate.size_bytes if self.goal.size_bytes is None else candidate.error)
+        is_size = self.goal.size_bytes is not None
+        for candidate in sorted(self.pool.made, key=lambda made: made.error if is_size else made.size_bytes):
+            if self._is_met(candidate):
+                return candidate
+        raise InputError(self._unreached_message())
 
     def best_with_levels(self, levels: FittedLevelBuilder) -> Candidate:
         """Return the best file with levels of detail, whose bytes count for a size.
@@ -206,7 +198,7 @@ class TargetSearch:
             log_factor = next_value(
                 0.0, [(log_tried, self._log_result(file)) for log_tried, file in made],
                 lambda log_tried: log_tried - log_level_0, bounds=(math.log(_LEAST_LEFT), 0.0),
-                margin=0.5 * near if made else 0.0, tolerance=near, tries=_ROUNDS,
+                margin=0.5 * near if made else 0.0, tolerance=near, tries=_FEW,
             )  # fmt: skip
             if log_factor is None:
                 break
@@ -243,7 +235,7 @@ class TargetSearch:
             return None
         candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
         if size_bytes is None:
-            if candidate.error > self.goal.error * error_of_psnr(-_BEYOND_REACH):
+            if candidate.error > self.goal.error:
                 raise InputError(self._unreached_message())
             return None
         return candidate if self._is_met(candidate) else None
@@ -251,89 +243,57 @@ class TargetSearch:
     def best_draft(self) -> tuple[Candidate, float]:
         """Return the draft of the best splats, coding and precision, and its expected error after another refit."""
         assert self.pruner is not None
-        subset, coding, _ = self._choose_splats(self.pruner)
+        subset, coding = self._choose_splats(self.pruner)
         draft = self.pool.make(subset, coding, self._predict(subset, coding)[0], draft=True)
         return draft, self._unquantised_error(subset, coding) + self._quantisation_error(draft)
 
     # The number of splats
 
-    def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding, list[tuple[Subset, Coding]]]:
-        """Return the best refitted splats and coding, and the pairs of more splats, most splats first.
+    def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding]:
+        """Return the best number of splats by the model, refitted, and their best coding. Add drafts to the pool.
 
-        The best have the least expected cost, but fewer splats must promise `_WORTH` over more, since their cost is
-        less certain. The pairs are none for a size. Refits splats, and adds drafts to the pool.
+        Brief refits correct the prediction of the pruning order, and the whole refit corrects theirs.
         """
-        kept_count = self._first_count(pruner)
-        tried = list[tuple[float, Subset, Coding]]()  # with the expected cost
-        for rounds_left in reversed(range(_ROUNDS)):
-            subset = pruner.refit(kept_count)
-            usual = self._first_codings(subset)[-1]
-            if rounds_left and self.work >= 1.0 and self._took_too_much(subset, usual):
-                kept_count = self._next_count(pruner, subset, usual)[0]
-                continue
-            most = len(self._first_codings(subset)) if self.goal.size_bytes is None else self._most_codings(subset)
-            coding = self._choose_coding(subset, most)
-            tried.append((self._predict(subset, coding)[1], subset, coding))
-            kept_count, saved = self._next_count(pruner, subset, coding)
-            # The promised saving has to be worth twice the time of a file.
-            if self.work < 1.0 or saved < _WORTH or not self._is_worth(0.5 * saved, subset):
-                break
-            if any(abs(len(earlier.model) - kept_count) <= _WORTH * kept_count for _, earlier, _ in tried):
-                break
-        tried.sort(key=lambda trial: -len(trial[1].model))
-        best = 0
-        for number, (cost, _, _) in enumerate(tried):
-            if cost < tried[best][0] - _WORTH:
-                best = number
-        larger = [(subset, coding) for _, subset, coding in tried[:best] if self.goal.size_bytes is None]
-        chosen = tried[best][1]
-        return chosen, self._choose_coding(chosen, self._most_codings(chosen)), larger
+        kept_count, turn = self._best_count(pruner), 0
+        while True:
+            part, rest_gain = REFITS[turn]
+            subset, coding = pruner.refit(kept_count, part), None
+            if self.goal.size_bytes is not None or self.goal.images is not None:  # what files of the goal are like
+                coding = self._choose_coding(subset, len(self._first_codings(subset)))
+            previous_count, kept_count = kept_count, self._best_count(pruner, subset, rest_gain, coding)
+            is_near = abs(kept_count - previous_count) <= _WORTH * kept_count
+            is_whole = part == 1.0 or len(subset.model) == len(self.whole.model)
+            turn += 1
+            if turn == len(REFITS) or (is_near and is_whole):
+                return subset, self._choose_coding(subset, self._most_codings(subset))
 
-    def _took_too_much(self, subset: Subset, coding: Coding) -> bool:
-        """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
-        if self.goal.size_bytes is not None:
-            return False
-        return self._unquantised_error(subset, coding) > _TOLERANCE * self._most_left_out * self._allowed
+    def _best_count(
+        self, pruner: Pruner, refitted: Subset | None = None, rest_gain: float = 0.0, coding: Coding | None = None
+    ) -> int:
+        """Return the best number of splats by the model, 1 to all. For a PSNR or a drop, extends the pruning order.
 
-    def _first_count(self, pruner: Pruner) -> int:
-        """Return the number of splats to begin with, 1 to all. For a PSNR or a drop, extends the pruning order."""
-        splats = len(self.whole.model)
-        if self.goal.size_bytes is not None:
-            usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
-            return self._rounded(min(self.goal.size_bytes / usual, splats))
-        allowed, kept_count = self._allowed, splats
-        known: tuple[int, float] | None = None
-        for rounds_left in reversed(range(_ROUNDS)):  # validation views show other pruning errors than training views
+        Args:
+            pruner: predicts the error of pruning.
+            refitted: splats whose measured error corrects the prediction; `None`: a refit has the usual gain, and a
+                size the usual bytes per splat.
+            rest_gain: dB by which another refit of them will reduce this error.
+            coding: for a size, the best coding of these splats, of which drafts were made.
+        """
+        size_bytes, allowed, known = self.goal.size_bytes, self._allowed, None
+        if refitted is not None:
+            # With all bands that the options keep: the error of dropped bands is not due to pruning.
+            known = len(refitted.model), error_of_psnr(rest_gain) * self._unquantised_error(refitted, Coding())
+        if size_bytes is None:
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
-            previous_count, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
-            if not rounds_left or abs(kept_count - previous_count) <= _WORTH * splats:
-                break
-            pruned = self.whole.model.select(pruner.order.kept(kept_count))
-            known = kept_count, error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)
-        return kept_count
-
-    def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
-        """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save.
-
-        The saving is compared with the splats of `subset`, whose measured error corrects the pruning order.
-        """
-        size_bytes, allowed, count = self.goal.size_bytes, self._allowed, len(subset.model)
-        # With all bands that the options keep: the error of dropped bands is not due to pruning.
-        with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
-        pruned = self._unquantised_error(subset, with_bands)
-        if size_bytes is None:
-            counts, errors = pruner.errors(allowed, (count, pruned))
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, _TOLERANCE * self._most_left_out)
+        elif refitted is None or coding is None:
+            return self._rounded(min(size_bytes / _USUAL_BYTES[self.whole.model.sh_degree > 0], len(self.whole.model)))
         else:
-            line = self._rate_line(subset, coding)
+            line = self._rate_line(refitted, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
-            counts, errors = pruner.errors(quantised, (count, pruned))
-            costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
-        fits = costs if size_bytes is not None else np.where(errors <= self._most_left_out * allowed, costs, np.inf)
-        best = int(np.argmin(fits))
-        here = np.searchsorted(-counts, -count)  # `counts` descend
-        return self._rounded(counts[best]), float(costs[here] - costs[best])
+            counts, errors = pruner.errors(quantised, known)
+            costs = log_bytes_at_size(counts / len(refitted.model), errors, quantised, self._exponent)
+        return self._rounded(counts[int(np.argmin(costs))])
 
     @property
     def _bytes_per_db(self) -> float:
@@ -409,17 +369,15 @@ class TargetSearch:
         best, quality = min(costs, key=costs.__getitem__, default=None), self._first_quality(subset, coding)
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
-        missed = _MISSED_GAIN if subset.refits and subset.classifiable and not coding.use_classes else 0.0
         earlier = self.pool.of(subset, coding, draft=subset.refits)  # when the number of splats was chosen
         if any(abs(quality - (draft.quality or 0.0)) < _NEAR for draft in earlier):
-            return self._predict(subset, coding)[1] + missed
+            return self._predict(subset, coding)[1]
         cost = math.inf
-        for _ in range(_ROUNDS):
+        for _ in range(_FEW):
             draft = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
                 self._measure_image_error(draft)
             quality, cost = self._predict(subset, coding)
-            cost += missed
             if abs(quality - (draft.quality or 0.0)) < _NEAR or (best is not None and cost > costs[best] + _WORTH):
                 break
         return cost
@@ -490,7 +448,7 @@ class TargetSearch:
     def _uniform_codings(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return variants of a coding with equal steps for all splats in one more respect, of importance or classes."""
         codings = [replace(coding, adaptive=None)] if coding.adaptive is not None else []
-        if subset.classifiable and coding.use_classes:
+        if subset.classifiable and coding.use_classes and not subset.refits:  # classes pay for refits
             codings.append(replace(coding, use_classes=False))
         return codings
 
@@ -503,6 +461,7 @@ class TargetSearch:
         """
         earlier = self.pool.of(subset, coding, draft=False) or self._by_distance(subset, coding, draft=True)[:1]
         for file in earlier:
+            self.pool.measure(file)
             self._measure_image_error(file)
         aim, is_pruned = AIM * self._log_result_per_db, len(subset.model) < len(self.whole.model)
         worth = subset.file_seconds / (100.0 * _SECONDS_PER_PERCENT) / self._bytes_per_db * self._log_result_per_db
@@ -523,7 +482,7 @@ class TargetSearch:
                     return True
             finest = max((file.quality or 0.0 for file in made), default=math.inf)
             if is_pruned and not is_met and len(made) > 1 and quality > finest + _FAR:
-                if len(made) > _REFITS or min(map(self._log_result, made)) > _NEAR * LOG_ERROR_PER_DB:
+                if len(made) > _FEW or min(map(self._log_result, made)) > _NEAR * LOG_ERROR_PER_DB:
                     return False  # other splats cost less
                 quality = finest + 2.0 * _NEAR  # refits through the quantisers differ by chance
             self._measure_image_error(self.pool.make(subset, coding, quality, draft=False))
@@ -644,7 +603,8 @@ class TargetSearch:
             return 0.0
         key = subset, degree
         if key not in self._errors:
-            self._errors[key] = self._error_in(self.pool.validation_scorer, drop_bands(subset.model, degree))
+            with_bands = drop_bands(subset.model, degree)
+            self._errors[key] = self.pool.error(with_bands, exact=not self.pool.renders)
         return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:
@@ -652,27 +612,28 @@ class TargetSearch:
         chosen = [self.pool.encoding.sh_degree, coding.degree, 0 if coding.sh == "none" else None]
         return min([self.whole.model.sh_degree, *(degree for degree in chosen if degree is not None)])
 
-    @staticmethod
-    def _error_in(scorer: Scorer, model: SplatModel) -> float:
-        """Return the mean squared error of a model, pooled over the views of a scorer."""
-        return scorer.pooled(scorer.errors(model))
-
     # Files on the goal
 
     def _measure_image_error(self, file: Candidate) -> None:
         """Set `image_error` of a file for a drop, unless it is set; do nothing for another goal."""
         if self.goal.images is not None and file.image_error is None:
-            file.image_error = self.pool.error(self.goal.images, file.result.data)
+            file.image_error = self.pool.image_error(self.goal.images, file)
 
     def _is_met(self, file: Candidate) -> bool:
-        """Return True if a file meets the goal and may be written; for a drop, False before `image_error` is set."""
+        """Return True if a file meets the goal and may be written; for a drop, False before `image_error` is set.
+
+        If its estimated error meets a PSNR, the error is measured.
+        """
         errors = file.result.report.errors
         if any(errors[name][0] > most for name, most in self.goal.max_error.items() if name in errors):
             return False
         if self.goal.size_bytes is not None:
             return file.size_bytes <= self.goal.size_bytes
-        error = file.error if self.goal.images is None else file.image_error
-        return error is not None and error <= self.goal.error
+        if self.goal.images is not None:
+            return file.image_error is not None and file.image_error <= self.goal.error
+        if file.error <= self.goal.error:
+            self.pool.measure(file)
+        return file.error <= self.goal.error
 
     def _try_presets(self, coding: Coding) -> None:
         """Make the presets' own files if their precision is near the goal, so that a search is not worse than these."""

@@ -5,7 +5,7 @@ search ends. Reports contain scores on test views. No view has two roles.
 
 | views | training | validation | test |
 |---|---|---|---|
-| virtual | `count` + 16 small views, all around | twelve like the test views | the eight of `psnr` |
+| virtual | `count` + 16 small views, all around | 48 like the test views | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual views | virtual views | all |
 | data set | training images | 16 for validation at most, else every 8th training image | held-out images |
@@ -57,7 +57,7 @@ _SPLIT_FROM = 40  # cameras; a file with at least this number is split into all 
 _TEST_EVERY, _TEST_MAX = 4, 24  # every Nth camera of a file is a test view, up to this number
 _VALIDATION_EVERY = 8  # every Nth view that is not a test view is a validation view
 _VALIDATION_MAX = 16  # validation images of a data set, at most
-_VALIDATION_SEED = 1000  # seed of virtual validation views, added to the user's
+_VALIDATION_SEED, _SET_SEEDS = 1000, 10_000  # added to the user's seed, for validation views and for each set of them
 _POSE_DIGITS = 9  # decimals of pose and field of view by which views are told apart
 _HOLD_OUT_EVERY = 8  # every Nth image is a test image by default
 
@@ -525,9 +525,16 @@ def _place_virtual(
     """
     if count < 1:
         return [], []
-    usual, width, height = virtual_views.VIRTUAL_SIZES.validation
-    kept = usual if validation_count is None else validation_count
-    validation = virtual_cameras(source, kept, width, height, seed=_VALIDATION_SEED + seed) if kept else []
+    sizes = virtual_views.VIRTUAL_SIZES
+    usual, width, height = sizes.validation
+    kept, sets = (
+        (usual, sizes.validation_sets) if validation_count is None else (validation_count, min(1, validation_count))
+    )
+    validation = [
+        camera
+        for part in range(sets)
+        for camera in virtual_cameras(source, kept, width, height, seed=_VALIDATION_SEED + seed + part * _SET_SEEDS)
+    ]
     return camera_sequence(source, count + HELD_OUT_COUNT, size, seed=seed), validation
 
 
