@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I64, Mask
+from csplat.types import F16, F32, F64, I64, Mask
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 
 _ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
 _UNDRAWN_KEY, _UNSEEN_KEY = -1.0, -0.5  # keys of splats to prune before all others, in this order
+_F16_MAX = float(np.finfo(np.float16).max)
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -34,12 +35,12 @@ class MeasuredViews:
     Attributes:
         cameras: the views.
         pruning_error: errors of removing each splat that is left, as last measured in these views.
-        renders: [H, W, 3], the render of each view; empty if they were not kept.
+        renders: [H, W, 3] float16, the render of each view; empty if they were not kept. The rounding is at 77 dB.
     """
 
     cameras: Sequence[Camera]
     pruning_error: PruningError
-    renders: Sequence[F32] = ()
+    renders: Sequence[F16] = ()
 
     @classmethod
     def of(
@@ -52,11 +53,15 @@ class MeasuredViews:
         context: Context = DEFAULT_CONTEXT,
     ) -> MeasuredViews:
         """Measure the pruning errors of a scene; other arguments as for `measure_pruning_error`."""
-        renders = list[F32]()
+        renders = list[F16]()
+
+        def keep(render: F32) -> None:
+            """Keep a render."""
+            renders.append(np.clip(render, -_F16_MAX, _F16_MAX).astype(np.float16))
+
         pruning_error = measure_pruning_error(
-            model, cameras, background=background, context=context,
-            on_render=renders.append if keep_renders else None,
-        )  # fmt: skip
+            model, cameras, background=background, context=context, on_render=keep if keep_renders else None
+        )
         return cls(cameras, pruning_error, renders)
 
     def __add__(self, other: MeasuredViews) -> MeasuredViews:

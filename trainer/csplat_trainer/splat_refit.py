@@ -21,7 +21,7 @@ from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.encoder.entropy import morton_codes
 from csplat.model import SplatModel
 from csplat.portable_math import exp
-from csplat.types import F32, I64
+from csplat.types import F16, F32, I64
 from csplat_render import Camera
 from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
 from csplat_render.metrics import squared_error
@@ -48,7 +48,7 @@ _SAMPLE = 8  # every Nth view is rendered to measure the error
 def refit_splats(
     model: SplatModel,
     cameras: Sequence[Camera],
-    references: Sequence[F32],
+    references: Sequence[F32 | F16],
     *,
     steps: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
@@ -60,7 +60,7 @@ def refit_splats(
     Args:
         model: the scene.
         cameras: the views.
-        references: [H, W, 3], the reference image of each view.
+        references: [H, W, 3] float32 or float16, the reference image of each view.
         steps: number of steps, one view each.
         background: red, green, blue behind the splats.
         moves: fit the centres instead of `shN`, whose values codebooks then still have; `means_double` is dropped.
@@ -88,7 +88,7 @@ def _order_in_space(means: F32) -> I64:
 def quantisation_aware_refit(
     fixed: FixedQuantisation,
     cameras: Sequence[Camera],
-    references: Sequence[F32],
+    references: Sequence[F32 | F16],
     *,
     steps: int,
     before: SplatModel,
@@ -124,7 +124,7 @@ class _TrainingViews:
     def __init__(
         self,
         cameras: Sequence[Camera],
-        references: Sequence[F32],
+        references: Sequence[F32 | F16],
         background: ArrayLike,
         antialiased: bool,
         context: Context,
@@ -136,6 +136,10 @@ class _TrainingViews:
     def __len__(self) -> int:
         return len(self._cameras)
 
+    def _reference(self, view: int) -> F32:
+        """Return the reference image of a view, [H, W, 3] float32."""
+        return np.asarray(self._references[view], np.float32)
+
     def rms(self, splats: HasSplats) -> float:
         """Return the root mean square error over a sample of the views."""
         errors = []
@@ -143,12 +147,12 @@ class _TrainingViews:
             render = self._rasteriser.forward(
                 splats, self._cameras[view], background=self._background, antialiased=self._antialiased
             )
-            errors.append(np.mean(squared_error(self._references[view], render.rgb)))
+            errors.append(np.mean(squared_error(self._reference(view), render.rgb)))
         return math.sqrt(np.mean(errors))
 
     def gradients(self, splats: HasSplats, view: int) -> tuple[float, Gradients]:
         """Return the mean squared error of a view's render, and the gradients of half its sum."""
-        reference = self._references[view]
+        reference = self._reference(view)
         error, gradients = self._rasteriser.error_gradients(
             splats, self._cameras[view], reference, background=self._background, antialiased=self._antialiased
         )
@@ -156,7 +160,7 @@ class _TrainingViews:
 
     def refit(self, splats: UncheckedSplats, view: int, step: AdamStep) -> float:
         """Make a step on splats with logits along the gradient of half the squared error; return the mean before."""
-        reference = self._references[view]
+        reference = self._reference(view)
         error = self._rasteriser.refit(
             splats, self._cameras[view], reference, step, background=self._background, antialiased=self._antialiased
         )

@@ -27,7 +27,7 @@ from csplat.encoder import (
 )
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I64
+from csplat.types import F16, F32, F64, I64
 from csplat_render import Camera
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
@@ -42,8 +42,8 @@ _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit
 #: refit after two brief ones gains 1.1 to 2.4 dB.
 REFITS = ((0.25, 2.0), (0.25, 1.5), (1.0, 0.2), (0.5, 0.0))
 REFIT_GAIN = 8.0  # dB by which a refit at least reduces the error of pruning
-# CPU seconds of a step by pixel and splat. With 240×180 pixels and SH 3, plane3 (5,000 splats) takes 25 ms.
-_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-7, 1.2e-6
+# CPU seconds of a step by pixel and splat. With 240×180 pixels and SH 3, plane3 (5,000 splats) takes 4 ms.
+_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-8, 2.5e-7
 
 
 @dataclass(eq=False)
@@ -100,15 +100,15 @@ class Pruner:
         return [camera for group in self.measured for camera in group.cameras]
 
     @cached_property
-    def references(self) -> list[F32]:
-        """[H, W, 3], the source's render of each view."""
+    def references(self) -> list[F16]:
+        """[H, W, 3] float16, the source's render of each view."""
         return [render for group in self.measured for render in group.renders]
 
     @cached_property
     def check_scorer(self) -> Scorer:
         """Scorer on held-out views, against which refits are checked."""
         check = self.sufficient.check
-        references = [ReferenceImage(render) for render in check.renders]
+        references = [ReferenceImage(render.astype(np.float32)) for render in check.renders]
         return Scorer(check.cameras, references, self.views.background, context=self.context)
 
     @property
