@@ -34,7 +34,7 @@ from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_search import Goal, TargetSearch
 
 USUAL_QUALITY = 42.0  # dB per attribute at which bytes per splat are those of the scene
-QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request
+QUALITIES = np.arange(24.0, 80.0, 0.2)  # dB, the qualities that a search may request
 PSNR_CAP = 99.0  # dB
 BOOKS = tuple(2**power for power in range(5, 13))
 
@@ -91,7 +91,6 @@ class AnalyticScene:
     jump: float = 0.0  # dB that every other step of 0.6 dB of quality loses
     packing: float = 1.008  # factor of the bytes of a file with fast compression
     preset_saving: tuple[str, float] = ("", 0.0)  # a preset, and the share that its own file saves
-    file_seconds: float = 0.0  # CPU seconds of making a file
 
     def model(self):
         """Return a model with this number of splats; their values do not matter."""
@@ -209,7 +208,7 @@ def search(
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
     pool = CandidatePool(options or EncodeOptions(), _Judge(scene, DECIDING), decode=lambda data: data)
     removal = None if no_prune else analytic_removal(scene, grades=grades)
-    whole = _Splats(scene, model, refits=False, classifiable=grades, file_seconds=scene.file_seconds)
+    whole = _Splats(scene, model, refits=False, classifiable=grades)
     goal, work = Goal.of(asked, model, photographs), SimplifyOptions(effort=effort).work
     try:
         best = TargetSearch(goal, pool, whole, removal, work).best()
@@ -264,7 +263,6 @@ class _Splats:
     model: SplatModel
     refits: bool
     classifiable: bool
-    file_seconds: float
 
     def encode(self, options, *, use_classes, draft):
         use_classes = use_classes and self.classifiable and options.max_classes != 1 and self.scene.grading != 1.0
@@ -307,5 +305,4 @@ class _Removal(Pruner):
         gain = self.scene.mended
         refitted = (gain - 1.5 * (part == 0.25)) / gain  # another refit gains 1.5 dB after a brief one
         model = replace(model, sh0=np.full_like(model.sh0, refitted))
-        how = {"classifiable": self.use_classes, "file_seconds": self.scene.file_seconds}
-        return _Splats(self.scene, model, refits=True, **how)
+        return _Splats(self.scene, model, refits=True, classifiable=self.use_classes)

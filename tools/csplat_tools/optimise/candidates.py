@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from csplat_tools.level_builder import FittedLevelBuilder
 
 _FEW_VIEWS = 12  # validation views in which drafts are compared, at least
-_SPLAT_SECONDS = 4e-5  # CPU seconds per splat of encoding and scoring all: 12 s for 306,000 of garden500k
 
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
@@ -82,16 +81,10 @@ class Subset(Protocol):
         model: the splats.
         refits: encoding refits the splats through the quantisers, which requires rendering; drafts skip that.
         classifiable: the splats may be sorted into quantisation classes.
-        file_seconds: typical CPU seconds of making another file at the default effort; a guess, so that no result
-            depends on the machine.
     """
 
     @property
     def model(self) -> SplatModel:  # noqa: D102
-        ...
-
-    @property
-    def file_seconds(self) -> float:  # noqa: D102
         ...
 
     @property
@@ -132,11 +125,6 @@ class WholeScene:
     def classifiable(self) -> bool:
         """True if importance was measured."""
         return self.measured is not None
-
-    @property
-    def file_seconds(self) -> float:
-        """Typical CPU seconds of encoding and scoring."""
-        return _SPLAT_SECONDS * len(self.model)
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""

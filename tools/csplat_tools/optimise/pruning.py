@@ -42,8 +42,6 @@ _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit
 #: refit after two brief ones gains 1.1 to 2.4 dB.
 REFITS = ((0.25, 2.0), (0.25, 1.5), (1.0, 0.2), (0.5, 0.0))
 REFIT_GAIN = 8.0  # dB by which a refit at least reduces the error of pruning
-# CPU seconds of a step by pixel and splat. With 240×180 pixels and SH 3, plane3 (5,000 splats) takes 4 ms.
-_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-8, 2.5e-7
 
 
 @dataclass(eq=False)
@@ -204,13 +202,6 @@ class PrunedSubset:
     def classifiable(self) -> bool:
         """True if the splats may be sorted into quantisation classes."""
         return self.pruner.use_classes
-
-    @property
-    def file_seconds(self) -> float:
-        """Typical CPU seconds of the refit of another file."""
-        width, height = self.pruner.size
-        step_seconds = _PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows)
-        return _STEPS // (2 if self.pruner.use_classes else 1) * step_seconds
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""

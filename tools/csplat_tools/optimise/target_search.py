@@ -2,7 +2,7 @@
 
 How a target is met:
 
-1. A size that no file of the scene needs, and a PSNR that none reaches, are recognised by one file (`finest`).
+1. A size that no file of the scene needs is recognised by one file (`finest`).
 2. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
    gives the first number of splats; for a size, typical bytes per splat do. These splats are refitted to renders of the
    source, in few steps. Their measured error corrects the prediction, until a whole refit confirms the number
@@ -75,11 +75,9 @@ _USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 
-# Range and number of the candidates.
-_QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
-_FINEST = 80.0  # dB of precision; from 70 dB on, opacities and quats have all their levels, and finer means cut tiles
+# Range and number of the candidates. From 70 dB on, opacities and quats have all their levels; finer means cut tiles.
+_QUALITIES = (24.0, 80.0)  # range of the precision, PSNR of each attribute alone, dB
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
-_HIGH = 55.0  # dB; a PSNR above it may be out of reach, which one file shows
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
 _FEW = 3  # most predictions of the count, brief refits, drafts of one coding, files that miss narrowly
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
@@ -89,8 +87,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # Distances, and the worth of another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
-_LEAST_LEFT = 0.01  # least factor of a goal that is left for the file without levels
-_SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
+_SPLAT_SAVING = 4e-8  # fraction of the bytes that another file must save, by splat; 1 % is worth 10 CPU seconds
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
 _AMPLE_REMARK = "the target is larger than this scene can use: {} hold all splats at the finest precision"
@@ -197,7 +194,7 @@ class TargetSearch:
         while True:
             log_factor = next_value(
                 0.0, [(log_tried, self._log_result(file)) for log_tried, file in made],
-                lambda log_tried: log_tried - log_level_0, bounds=(math.log(_LEAST_LEFT), 0.0),
+                lambda log_tried: log_tried - log_level_0, bounds=(math.log(LEAST_QUANTISED), 0.0),
                 margin=0.5 * near if made else 0.0, tolerance=near, tries=_FEW,
             )  # fmt: skip
             if log_factor is None:
@@ -223,21 +220,11 @@ class TargetSearch:
     def finest(self) -> Candidate | None:
         """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
 
-        It is made only if the size may be that large, or a PSNR that high.
-
-        Raises:
-            InputError: the PSNR is out of reach by far.
+        It is made only if the size may be that large.
         """
-        size_bytes = self.goal.size_bytes
-        if size_bytes is None and (self.goal.images is not None or self.goal.error > error_of_psnr(_HIGH)):
+        if self.goal.size_bytes is None or self.goal.size_bytes < _AMPLE * len(self.whole.model):
             return None
-        if size_bytes is not None and size_bytes < _AMPLE * len(self.whole.model):
-            return None
-        candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
-        if size_bytes is None:
-            if candidate.error > self.goal.error:
-                raise InputError(self._unreached_message())
-            return None
+        candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _QUALITIES[1], draft=False)
         return candidate if self._is_met(candidate) else None
 
     def best_draft(self) -> tuple[Candidate, float]:
@@ -464,7 +451,7 @@ class TargetSearch:
             self.pool.measure(file)
             self._measure_image_error(file)
         aim, is_pruned = AIM * self._log_result_per_db, len(subset.model) < len(self.whole.model)
-        worth = subset.file_seconds / (100.0 * _SECONDS_PER_PERCENT) / self._bytes_per_db * self._log_result_per_db
+        worth = _SPLAT_SAVING * len(subset.model) / self._bytes_per_db * self._log_result_per_db
         while True:
             made, line = self.pool.of(subset, coding, draft=False), self._rate_line(subset, coding)
             quality = next_value(
@@ -524,10 +511,6 @@ class TargetSearch:
         if self.goal.size_bytes is None:
             return line.log_bytes_at(quality)
         return self._exponent * math.log(self._unquantised_error(subset, coding) + line.error_at(quality))
-
-    def _is_worth(self, saved: float, subset: Subset) -> bool:
-        """Return True if the fraction of the bytes that another file is expected to save is worth its time."""
-        return 100.0 * saved * _SECONDS_PER_PERCENT >= subset.file_seconds
 
     def _rate_line(self, subset: Subset, coding: Coding) -> RateLine:
         """Return quantisation error and bytes of a subset and coding by precision.
