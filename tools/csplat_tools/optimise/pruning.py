@@ -38,9 +38,9 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit through the quantisers
-#: Refits that settle the number of splats: part of the usual steps, and dB that another refit gains. In four scenes, a
-#: refit after two brief ones gains 1.1 to 2.4 dB.
-REFITS = ((0.25, 2.0), (0.25, 1.5), (1.0, 0.2), (0.5, 0.0))
+#: Refits that settle the number of splats: part of the usual steps, and dB that later ones gain, up to those of a file.
+#: In four scenes, a refit after two brief ones gains 1.1 to 2.4 dB.
+REFITS = ((0.25, 2.8), (0.25, 2.3), (1.0, 0.8), (0.5, 0.6))
 REFIT_GAIN = 8.0  # dB by which a refit at least reduces the error of pruning
 
 

@@ -269,7 +269,8 @@ class TargetSearch:
         size_bytes, allowed, known = self.goal.size_bytes, self._allowed, None
         if refitted is not None:
             # With all bands that the options keep: the error of dropped bands is not due to pruning.
-            known = len(refitted.model), error_of_psnr(rest_gain) * self._unquantised_error(refitted, Coding())
+            error = self._unquantised_error(refitted, Coding(), exact=rest_gain < _NEAR)
+            known = len(refitted.model), error_of_psnr(rest_gain) * error
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
@@ -468,7 +469,7 @@ class TargetSearch:
                 if any(self._is_met(file) for file in smaller):  # other splats or another coding cost less
                     return True
             finest = max((file.quality or 0.0 for file in made), default=math.inf)
-            if is_pruned and not is_met and len(made) > 1 and quality > finest + _FAR:
+            if is_pruned and not is_met and len(made) > 1 and quality > (made[0].quality or 0.0) + _FAR:
                 if len(made) > _FEW or min(map(self._log_result, made)) > _NEAR * LOG_ERROR_PER_DB:
                     return False  # other splats cost less
                 quality = finest + 2.0 * _NEAR  # refits through the quantisers differ by chance
@@ -579,15 +580,18 @@ class TargetSearch:
         )
         return error * (error_of_psnr(_TUNING_GAIN) if candidate.is_draft else 1.0)
 
-    def _unquantised_error(self, subset: Subset, coding: Coding) -> float:
-        """Return the mean squared error before quantisation, of pruning and dropped SH bands; it is measured once."""
+    def _unquantised_error(self, subset: Subset, coding: Coding, *, exact: bool = False) -> float:
+        """Return the mean squared error before quantisation, of pruning and dropped SH bands; it is measured once.
+
+        It is measured on all validation views if `exact`, and the first time, otherwise on a few of them.
+        """
         degree = self._degree(coding)
         if not subset.refits and degree == self.whole.model.sh_degree:
             return 0.0
         key = subset, degree
         if key not in self._errors:
             with_bands = drop_bands(subset.model, degree)
-            self._errors[key] = self.pool.error(with_bands, exact=not self.pool.renders)
+            self._errors[key] = self.pool.error(with_bands, exact=exact or not self.pool.renders)
         return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:
