@@ -165,6 +165,7 @@ class SearchReport:
         pruning_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
         chosen, tried: the chosen file and all candidates.
         why, sure: explanations of the choice, and of the accuracy of the PSNR.
+        interrupted: the search was interrupted, and its best file so far was chosen.
     """
 
     goal: dict[str, Any]
@@ -189,6 +190,7 @@ class SearchReport:
     tried: tuple[dict[str, Any], ...] = ()
     why: tuple[str, ...] = ()
     sure: str = ""
+    interrupted: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""

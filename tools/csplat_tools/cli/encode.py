@@ -10,6 +10,7 @@ import typer
 import csplat
 from csplat.context import Context
 from csplat.encoder import EncodeOptions, Target
+from csplat.errors import SearchInterrupted
 from csplat.model import SplatModel
 from csplat.out_of_core import estimate_cost
 from csplat.scene import Scene
@@ -93,11 +94,12 @@ def encode(
     for archives, small if size matters more than precision. One of
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
     chooses the precision and prunes splats; it goes on as long as it expects to
-    save 1 % of the bytes per 10 CPU seconds. --max-error limits errors of means,
-    covariance, opacities, sh0 to sh4. Views are virtual without --data, which
-    requires the render extra, or --cameras. --levels adds coarser versions of
-    the scene, which viewers show first: 35 % more bytes, and minutes. --help-all
-    shows --keep, --cameras, --up and all other options.
+    save 1 % of the bytes per 10 CPU seconds, and Ctrl-C takes the best file so
+    far that meets the target. --max-error limits errors of means, covariance,
+    opacities, sh0 to sh4. Views are virtual without --data, which requires the
+    render extra, or --cameras. --levels adds coarser versions of the scene,
+    which viewers show first: 35 % more bytes, and minutes. --help-all shows
+    --keep, --cameras, --up and all other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
@@ -153,10 +155,15 @@ def encode(
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
                 view_set = _find_views(scene.model(), options, target, views, out, context)
-        encoded = encode_file(
-            scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
-            source_index=source_index, levels=level_count, format=read_as, context=context,
-        )  # fmt: skip
+        try:
+            encoded = encode_file(
+                scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
+                source_index=source_index, levels=level_count, format=read_as, context=context,
+            )  # fmt: skip
+        except SearchInterrupted as interrupt:
+            if interrupt.best is not None:
+                _publish_encoded(interrupt.best, source, output, out, up=up)
+            raise
         _publish_encoded(encoded, source, output, out, up=up)
         if level_count is None:
             written = encoded.source.changed(count=encoded.result.report.splat_count)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat.context import Context
+from csplat.errors import SearchInterrupted
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name, write_model
@@ -40,7 +41,8 @@ def simplify(
     Splats are fitted to training views, validation views decide how many are
     kept, and test views score the result. --max-psnr-drop requires --data.
     `csplat encode` with a target does the same for the file that it writes.
-    --data requires the render extra.
+    Ctrl-C takes the fewest splats so far that meet the target. --data requires
+    the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -75,7 +77,15 @@ def simplify(
             "--effort 1 takes less",
         )
         context = Context(progress=progress)
-        result = csplat_tools.simplify(model, target, views=view_set, options=options, context=context)
+        interrupt = None
+        try:
+            result = csplat_tools.simplify(model, target, views=view_set, options=options, context=context)
+        except SearchInterrupted as caught:
+            if caught.best is None:
+                raise
+            result, interrupt = caught.best, caught
     write_model(output, result.model, absolute=False)
     out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)
+    if interrupt is not None:
+        raise interrupt

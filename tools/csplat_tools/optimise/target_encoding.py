@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Target, meet_bounds
-from csplat.errors import InputError
+from csplat.errors import InputError, SearchInterrupted, counted
 from csplat.model import SplatModel
+from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.views import ViewSet, find_view_set
@@ -47,6 +48,7 @@ def meet_target(
     Raises:
         InputError: the renderer is not installed, there are no splats, an option is set that the target determines, or
             the target is out of reach.
+        SearchInterrupted: Ctrl-C interrupted the search; `best` is the best file so far that meets the target, if any.
     """
     start = time.perf_counter()
     require_renderer()
@@ -68,7 +70,13 @@ def meet_target(
         options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, context=context,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
-    return chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
+    result = chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
+    if report.interrupted:
+        files, size = counted(report.encodes, "file"), format_bytes(chosen.size_bytes)
+        raise SearchInterrupted(
+            f"interrupted: the best of {files} so far was taken, {size} with {chosen.validation_psnr:.2f} dB", result
+        )
+    return result
 
 
 def expected_search_seconds(
