@@ -46,8 +46,8 @@ class Target:
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         max_error: largest error of any splat by measure of the format: means in scene units, covariance relative,
             opacities, sh0 to sh4. Alone it requires no rendering.
-        prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes a
-            sixth of the time.
+        prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes less
+            than half of the time.
         effort: 1 to 9, work of the search: number of views, candidates and refit steps.
 
     Raises:

@@ -35,7 +35,6 @@ from csplat_tools.optimise.candidates import CandidatePool, WholeScene
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
 from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.target_search import expected_renders
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
@@ -282,14 +281,7 @@ def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
     np.testing.assert_array_equal(weights, complete_importance(scene, views, plain, weights, inside=False)[0].sh)
 
 
-def test_the_expected_renders_depend_on_the_target_and_their_seconds_exclude_the_first(scene):
-    target, options, fast = Target(psnr=30.0), EncodeOptions(), EncodeOptions(preset="fast")
-    most, least = (expected_renders(options, replace(target, prune=prune)) for prune in (True, False))
-    assert 0.0 < least < most
-    assert {least} == {expected_renders(one, target) for one in (fast, EncodeOptions(keep_extra=True))}
-    assert least == expected_renders(options, replace(target, max_error={"means": 1.0}))
-    assert most == expected_renders(fast, Target(keep=0.5))
-    assert most > expected_renders(options, replace(target, effort=1))
+def test_the_time_of_a_render_excludes_the_first(scene):
     views, drawn, now = comparison_cameras(scene), [], [0.0]
 
     def draw(camera):

@@ -154,7 +154,7 @@ def encode(
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                view_set = _find_views(scene.model(), options, target, views, out, context)
+                view_set = _find_views(scene.model(), options, target, views, level_count, out, context)
         try:
             encoded = encode_file(
                 scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
@@ -212,6 +212,7 @@ def _find_views(
     options: EncodeOptions,
     target: Target,
     views: shared.ViewOptions,
+    levels: LevelCount,
     out: Output,
     context: Context,
 ) -> ViewSet:
@@ -222,7 +223,9 @@ def _find_views(
     if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
         out.announce_time(
-            lambda: expected_search_seconds(model, options, target, view_set, context),
-            "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
+            lambda: expected_search_seconds(
+                model, options, target, view_set, has_levels=levels is not None, context=context
+            ),
+            "--no-prune takes less than half of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
     return view_set

@@ -15,10 +15,6 @@ from csplat_tools.inspect.text_reports import format_simplification
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import load_scene
 
-#: Cost in renders of all training views: for --keep, and for a target, which searches for the fraction to keep. Half of
-#: the cost is fitting.
-_PASSES = (20.0, 45.0)
-
 
 def simplify(
     source: shared.SceneArgument,
@@ -58,9 +54,8 @@ def simplify(
         raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
+    from csplat_tools.optimise.search_plan import plan_seconds, simplify_plan
     from csplat_tools.optimise.simplify import SimplifyOptions
-    from csplat_tools.views import shrink_cameras
-    from csplat_tools.views.view_sets import total_render_seconds
 
     options = SimplifyOptions(effort=target.effort)
     out.check(output, inputs=(source, *views.inputs))
@@ -70,12 +65,8 @@ def simplify(
         out.print_findings(read.findings)
         model = overrides.apply_to_model(read.model())
         view_set = views.find(model, out)
-        passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
-        size = options.views_and_size(len(model))[1]
-        out.announce_time(
-            lambda: passes * total_render_seconds(model, shrink_cameras(view_set.training, size)),
-            "--effort 1 takes less",
-        )
+        plan = simplify_plan(options.pruner(model, view_set), target)
+        out.announce_time(lambda: plan_seconds(plan, model, view_set), "--effort 1 takes less")
         context = Context(progress=progress)
         interrupt = None
         try:

@@ -161,6 +161,14 @@ class Pruner:
         self._last = PrunedSubset(self, model, rows, psnr_pruned, psnr, is_refused)
         return self._last
 
+    def planned_steps(self, refits: float, files: float) -> tuple[float, float]:
+        """Return the numbers of steps that some refits take, and those through the quantisers of some files."""
+        later = _STEPS // (4 if self.use_classes else 2)
+        return (
+            self.scaled_steps(_STEPS) + (refits - 1.0) * self.scaled_steps(_STEPS // 2),
+            self.scaled_steps(_STEPS // 2) + (files - 1.0) * self.scaled_steps(later),
+        )
+
     def scaled_steps(self, usual: int) -> int:
         """Return a number of steps, times `steps_factor`, at least 1."""
         return max(1, round(usual * self.steps_factor))

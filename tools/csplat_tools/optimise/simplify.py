@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,9 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_tools.optimise.pruning import PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import AIM, LOG_ERROR_PER_DB, NOTHING, error_of_psnr
+from csplat_tools.optimise.search_plan import SCORES, simplify_plan
 from csplat_tools.optional_packages import require_renderer
+from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
@@ -148,12 +150,17 @@ def simplify(
     if views is None:
         count, size = options.views_and_size(len(source))
         views = find_view_set(source, background=options.background, count=count, size=size, seed=context.seed)
+    plan = simplify_plan(options.pruner(source, views), target)
+    progress = PlannedProgress("search", plan, context.progress)
+    context = replace(context, progress=progress)
     pruner, scores = options.pruner(source, views, context=context), dict[str, Any]()
     if target.keep is not None:
         subset = pruner.refit(target.count(len(source)))
     else:
         subset, scores = _prune_to_psnr(pruner, target)
+    progress(SCORES, 0.0)
     report = {**_pruning_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
+    progress(SCORES, 1.0)
     report["seconds"] = round(time.perf_counter() - start, 2)
     notes = (_NOT_PRUNED,) if target.keep is None and len(subset.rows) == len(source) else ()
     simplified = Simplified(subset.model, subset.rows, report, notes)

@@ -13,8 +13,7 @@ from csplat.model import SplatModel
 from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optional_packages import require_renderer
-from csplat_tools.views import ViewSet, find_view_set
-from csplat_tools.views.view_sets import render_seconds
+from csplat_tools.views import ViewSet, find_view_set, with_validation_views
 
 if TYPE_CHECKING:
     from csplat_tools.level_builder import FittedLevelBuilder
@@ -80,9 +79,17 @@ def meet_target(
 
 
 def expected_search_seconds(
-    source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet, context: Context = DEFAULT_CONTEXT
+    source: SplatModel,
+    options: EncodeOptions,
+    target: Target,
+    views: ViewSet,
+    *,
+    has_levels: bool = False,
+    context: Context = DEFAULT_CONTEXT,
 ) -> float:
     """Estimate the seconds of `meet_target` on this machine, from the time of some renders of test views."""
-    from csplat_tools.optimise.target_search import expected_renders
+    from csplat_tools.optimise.search_plan import plan_seconds, search_plan
+    from csplat_tools.optimise.simplify import SimplifyOptions
 
-    return expected_renders(options, target) * render_seconds(source, views.test, context=context)
+    pruner = SimplifyOptions(effort=target.effort).pruner(source, with_validation_views(views))
+    return plan_seconds(search_plan(pruner, target, options, has_levels=has_levels), source, views, context)

@@ -64,13 +64,11 @@ from csplat_tools.optimise.rate_distortion import (
     rate_exponent,
 )
 from csplat_tools.optimise.scene_sensitivity import MANY_SPLATS, complete_importance
+from csplat_tools.optimise.search_plan import SCORES, keeps_all, search_plan
 from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
-
-# Cost of meeting a target, in renders of one test view.
-_SEARCH_RENDERS = 520.0  # search of an encoding; does not depend on the effort
-_PRUNING_RENDERS = 2480.0  # pruning at the default effort
 
 # Typical values; pairs are without and with SH.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
@@ -679,6 +677,11 @@ class TargetSearch:
         met = [file for file in self._files if self._is_met(file)]
         return min(met, key=lambda file: file.size_bytes if self.goal.size_bytes is None else file.error, default=None)
 
+    def describe_best(self) -> str:
+        """Describe the best file so far that meets the goal, for progress; empty if there is none."""
+        best = self.best_so_far()
+        return f"best so far {format_bytes(best.size_bytes)}, {best.validation_psnr:.1f} dB" if best else ""
+
     def interrupted_message(self) -> str:
         """Return the message if the search is interrupted before any file meets the goal: the nearest, and a remedy."""
         so_far = self._unreached_message() if self._files else f"no file{self._kind} was made"
@@ -757,6 +760,9 @@ def search_target(
             returned, and `interrupted` is set in the report.
     """
     views = with_validation_views(views)
+    plan = search_plan(options.pruner(source, views), target, encoding, has_levels=levels is not None)
+    progress = PlannedProgress("search", plan, context.progress)
+    context = replace(context, progress=progress)
     test_scorer = views.test_scorer(source, context=context)
     if views.name != VIRTUAL and _is_empty(test_scorer):
         raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
@@ -769,10 +775,11 @@ def search_target(
     images = None if target.max_psnr_drop is None else views.image_validation_scorer(context=context)
     goal, whole = Goal.of(target, source, images), WholeScene(source, importance, None, context)
     search = TargetSearch(goal, pool, whole, None, options.work, None if levels is None else [])
+    progress.note = search.describe_best
     finest, interrupted = None, False
     try:
         finest = None if levels is not None else search.finest()
-        if finest is None and not _keeps_all(target, encoding):
+        if finest is None and not keeps_all(target, encoding):
             pruner = search.pruner = options.pruner(source, views, use_classes=not inside, context=context)
         if finest is not None:
             chosen = finest
@@ -793,6 +800,7 @@ def search_target(
         if best is None:
             raise SearchInterrupted(search.interrupted_message()) from None
         chosen = best
+    progress(SCORES, 0.0)
     remarks = [_INSIDE_REMARK] if inside and chosen.splats < len(source) else []
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
@@ -806,20 +814,8 @@ def search_target(
         reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
         interrupted=interrupted,
     )  # fmt: skip
+    progress(SCORES, 1.0)
     return chosen, report
-
-
-def expected_renders(encoding: EncodeOptions, target: Target) -> float:
-    """Return the approximate cost of meeting a target, in renders of one test view."""
-    if _keeps_all(target, encoding):
-        return _SEARCH_RENDERS
-    return _SEARCH_RENDERS + _PRUNING_RENDERS * SimplifyOptions(effort=target.effort).work
-
-
-def _keeps_all(target: Target, encoding: EncodeOptions) -> bool:
-    """Return True if no splat may be pruned, due to the target, error bounds, extra columns or the preset `fast`."""
-    blocked = not target.prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
-    return target.keep is None and blocked
 
 
 def check_target(source: SplatModel, target: Target, encoding: EncodeOptions) -> None:
