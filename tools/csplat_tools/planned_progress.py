@@ -52,13 +52,13 @@ class PlannedProgress:
 
     Args:
         run: name of the run.
-        plan: its phases. A report of a stage ends the phases before, and 1 of a stage of the last phase ends the run.
-            Other stages are not told from the last that is in the plan.
+        plan: its phases. A report of a stage ends the phases before, and 1 of the last stage of the plan ends the run.
+            Stages that are not in the plan are not told from the last that is.
         report: called with the name and the fraction.
         clock: returns seconds.
 
     Attributes:
-        note: returns a remark to report, such as the best result so far; called when a stage ends.
+        note: returns a remark to report, such as the best result so far; called when a stage ends, and after that.
     """
 
     def __init__(self, run: str, plan: Plan, report: Progress, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -67,6 +67,7 @@ class PlannedProgress:
         self._phases = [{name: _Stage(name, work) for name, work in phase.items()} for phase in plan]
         self._phase, self._last, self._remark = 0, _Stage("", PlannedWork(0.0, 0.0)), ""
         self._open: _Stage | None = None
+        self._is_over = False  # the last report was 1
         self._begun = self._at = clock()  # start, and time of the last report of a stage of the plan
 
     def __call__(self, stage: str, done: float) -> None:
@@ -84,10 +85,12 @@ class PlannedProgress:
             reported.count += done > 0.0
             if done == 0.0:
                 self._open = reported
-            elif done >= 1.0:
-                self._open, self._remark = None if self._open is reported else self._open, self.note()
-            self._phase, self._last, self._at = number, reported, now
-        has_ended = done >= 1.0 and number == len(self._phases) - 1
+            elif done >= 1.0 and self._open is reported:
+                self._open = None
+            if done >= 1.0 or self._is_over:
+                self._remark = self.note()
+            self._phase, self._last, self._at, self._is_over = number, reported, now, done >= 1.0
+        has_ended = self._is_over and self._last is [*self._phases[-1].values()][-1]
         words = "; ".join(filter(None, (self._last.name, self._remark)))
         self._report(f"{self._run}: {words}", 1.0 if has_ended else self._fraction(now))
 

@@ -43,7 +43,7 @@ def test_searches_take_longer_with_more_choices_and_effort(scene):
 def test_a_plan_takes_time_in_proportion_to_that_of_a_render_and_none_without_splats_or_test_views(scene, monkeypatch):
     monkeypatch.setattr("csplat_tools.optimise.search_plan.render_seconds", lambda *_, **__: 0.5)
     views, target = with_validation_views(judged_by(cameras(40))), Target(psnr=30.0)
-    plan = simplify_plan(SimplifyOptions().pruner(scene, views), target)
+    plan = search_plan(SimplifyOptions().pruner(scene, views), target, EncodeOptions())
     drawn = len(views.test) + len(views.validation)  # of one size
     assert 0.5 * drawn == pytest.approx(plan_seconds(plan[:1], scene, views))
     nothing = scene.select(slice(0))

@@ -219,6 +219,7 @@ def _find_views(
     """Find the views of a scene, and announce how long the search will take."""
     from csplat_tools.optimise.target_encoding import expected_search_seconds
 
+    context.progress("placing views", 0.0)
     view_set = views.find(model, out)
     if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
@@ -228,4 +229,5 @@ def _find_views(
             ),
             "--no-prune takes less than half of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
+    context.progress("placing views", 1.0)
     return view_set

@@ -49,13 +49,14 @@ def search_plan(pruner: Pruner, target: Target, encoding: EncodeOptions, *, has_
     is_whole, is_search = keeps_all(target, encoding), target.keep is None
     count = len(source) if is_whole else _kept_count(source, target)
     cost, importance = view_cost(math.prod(pruner.size), count), len(importance_views(pruner.views, count))
+    scored = [*pruner.views.test, *pruner.views.validation]
     last = [
         {LEVELS: PlannedWork(_LEVELLED[is_search], _LEVELS * count)} if has_levels else {},
         {SCORES: PlannedWork(1.0, _SCORES * cost)},
     ]
     if is_whole:
         return [
-            _drawing(pruner),
+            _drawing(source, scored),
             {"measuring sensitivity": PlannedWork(importance, _SENSITIVITY * cost)},
             {FILE: PlannedWork(_FILES_OF_ALL[has_sh], _DRAFT * cost)},
             *last,
@@ -64,7 +65,7 @@ def search_plan(pruner: Pruner, target: Target, encoding: EncodeOptions, *, has_
     drafts = (_DRAFTS if target.size is None else _DRAFTS_OF_SIZE)[has_sh] if is_search else 0.0
     steps, file_steps = pruner.planned_steps(refits, files)
     return [
-        _drawing(pruner),
+        _drawing(source, scored),
         _measuring(pruner, target),
         {
             "refitting splats": PlannedWork(steps, STEP_COST * cost),
@@ -81,10 +82,10 @@ def simplify_plan(pruner: Pruner, target: Target) -> Plan:
     cost = view_cost(math.prod(pruner.size), _kept_count(pruner.source, target))
     steps = pruner.planned_steps(1.0 if target.keep is not None else _REFITS_OF_SIMPLIFY, 0.0)[0]
     return [
-        _drawing(pruner),
+        _drawing(pruner.source, pruner.views.validation),
         _measuring(pruner, target),
         {"refitting splats": PlannedWork(steps * pruner.refits, STEP_COST * cost)},
-        {SCORES: PlannedWork(1.0, _SCORES * cost)},
+        {**_drawing(pruner.source, pruner.views.test), SCORES: PlannedWork(1.0, _SCORES * cost)},
     ]
 
 
@@ -101,10 +102,9 @@ def keeps_all(target: Target, encoding: EncodeOptions) -> bool:
     return target.keep is None and blocked
 
 
-def _drawing(pruner: Pruner) -> dict[str, PlannedWork]:
-    """Return the work of rendering the source for the scorers."""
-    cameras = [*pruner.views.test, *pruner.views.validation]
-    return {"drawing the source": PlannedWork(len(cameras), _render_cost(pruner.source, cameras))}
+def _drawing(source: SplatModel, cameras: Sequence[Camera]) -> dict[str, PlannedWork]:
+    """Return the work of rendering the source for a scorer."""
+    return {"drawing the source": PlannedWork(len(cameras), _render_cost(source, cameras))}
 
 
 def _measuring(pruner: Pruner, target: Target) -> dict[str, PlannedWork]:

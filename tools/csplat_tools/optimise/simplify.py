@@ -157,7 +157,7 @@ def simplify(
     if target.keep is not None:
         subset = pruner.refit(target.count(len(source)))
     else:
-        subset, scores = _prune_to_psnr(pruner, target)
+        subset, scores = _prune_to_psnr(pruner, target, progress)
     progress(SCORES, 0.0)
     report = {**_pruning_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
     progress(SCORES, 1.0)
@@ -170,7 +170,7 @@ def simplify(
     return simplified
 
 
-def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, Any]]:
+def _prune_to_psnr(pruner: Pruner, target: Target, progress: PlannedProgress) -> tuple[PrunedSubset, dict[str, Any]]:
     """Return the fewest splats that reach a PSNR on validation views, and entries for the report: their PSNR, dB.
 
     For a drop, the PSNR is against images, otherwise against renders of the source. Each number is predicted from the
@@ -191,6 +191,7 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
     allowed, refits = error_of_psnr(goal), list[tuple[float, PrunedSubset]]()
     entries = dict[str, Any]()
+    progress.note = lambda: _describe_fewest(refits, allowed)
     try:
         _add_refits(refits, pruner, scorer, source_error, allowed)
     except KeyboardInterrupt:
@@ -231,6 +232,15 @@ def _add_refits(
         error = scorer.pooled(scorer.errors(subset.model))
         refits.append((error, subset))
         last = len(subset.rows), max(error - source_error, 0.0)
+
+
+def _describe_fewest(refits: Sequence[tuple[float, PrunedSubset]], allowed: float) -> str:
+    """Describe the fewest splats so far of at most this mean squared error, for progress; empty if there are none."""
+    reached = [(len(subset.rows), error) for error, subset in refits if error <= allowed]
+    if not reached:
+        return ""
+    count, error = min(reached)
+    return f"best so far {counted(count, 'splat')}, {psnr_of_mse(error):.1f} dB"
 
 
 def _nearest_message(refits: Sequence[tuple[float, PrunedSubset]], goal: float) -> str:
