@@ -32,7 +32,15 @@ if TYPE_CHECKING:
     from csplat.editing.merge import merge
     from csplat.encode_api import encode, encode_with_report
     from csplat.encoder import EncodeOptions, EncodeResult, Target
-    from csplat.errors import CsplatError, FormatError, InputError, LimitError, StoreError, UnsupportedError
+    from csplat.errors import (
+        CsplatError,
+        FormatError,
+        InputError,
+        LimitError,
+        SearchInterrupted,
+        StoreError,
+        UnsupportedError,
+    )
     from csplat.formats import open, read, write
     from csplat.interop import from_gsplat, to_gsplat
     from csplat.model import SplatModel
@@ -53,6 +61,7 @@ __all__ = [
     "LimitError",
     "Scene",
     "SceneMetadata",
+    "SearchInterrupted",
     "SplatFile",
     "SplatModel",
     "StoreError",
@@ -114,6 +123,7 @@ _MODULE_OF = {
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
     "Scene": "csplat.scene",
+    "SearchInterrupted": "csplat.errors",
     "SceneMetadata": "csplat.scene_metadata",
     "SplatFile": "csplat.splat_file",
     "SplatModel": "csplat.model",

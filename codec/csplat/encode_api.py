@@ -18,7 +18,7 @@ from csplat.encoder.levels import LevelBuilder
 from csplat.encoder.pipeline import EncodeResult, encode_tiles
 from csplat.encoder.splat_importance import Importance
 from csplat.encoder.target import Target, Views
-from csplat.errors import InputError
+from csplat.errors import InputError, SearchInterrupted
 from csplat.model import SplatModel, check_model
 from csplat.out_of_core import encode_on_disk, estimate_cost
 from csplat.plugins import load_plugins
@@ -129,6 +129,8 @@ def encode(
             folder exists, belongs to another scene or is damaged.
         CsplatError: the scene cannot be read.
         OSError: a file cannot be read or written; or a worker was killed.
+        SearchInterrupted: Ctrl-C interrupted a search for a target; a `KeyboardInterrupt`. If a file so far meets the
+            target, `best` is the `EncodeResult` of the best, which has been written to `out`.
     """
     result = encode_with_report(
         scene, options, out=out, target=target, views=views, importance=importance, levels=levels, context=context
@@ -183,11 +185,21 @@ def encode_with_report(
                     "the scene is encoded on disk, because it exceeds memory or workers are set: out must be a path"
                 )
             return EncodeResult(encode_on_disk(scene, path, options, cost, context, builder))
-    result = _encode_model(scene.model(), options, target, views, importance, builder, context)
+    try:
+        result = _encode_model(scene.model(), options, target, views, importance, builder, context)
+    except SearchInterrupted as interrupt:
+        if interrupt.best is not None:
+            _write(interrupt.best, out)
+        raise
+    _write(result, out)
+    return result
+
+
+def _write(result: EncodeResult, out: Output | None) -> None:
+    """Write a file, whole or not at all, unless `out` is `None`."""
     if out is not None:
         with open_writer(out) as stream:
             stream.write(result.data)
-    return result
 
 
 def _encode_model(

@@ -8,10 +8,13 @@
 | `InputError` | the caller's data is invalid: a PLY, an array, an option | see the message |
 | `StoreError` | a server or the connection failed | try again |
 
-Every error has a `code`, a short constant string that programs may compare.
+Every error has a `code`, a short constant string that programs may compare. `SearchInterrupted` is no error but an
+interrupt, Ctrl-C, of a search for a target, and has the best result so far.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 
 class CsplatError(Exception):
@@ -140,6 +143,22 @@ class StoreError(CsplatError):
 
     def __init__(self, message: str) -> None:
         super().__init__(message)
+
+
+class SearchInterrupted(KeyboardInterrupt):
+    """A search for a target was interrupted by Ctrl-C.
+
+    Programs that do not know it end as by any other `KeyboardInterrupt`.
+
+    Args:
+        message: the best result so far, or the nearest to the target.
+        best: the best result so far that meets the target, of the type that the interrupted function returns; `None` if
+            none does.
+    """
+
+    def __init__(self, message: str, best: Any = None) -> None:
+        super().__init__(message)
+        self.best = best
 
 
 def counted(count: int, singular: str, plural: str | None = None) -> str:

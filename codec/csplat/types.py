@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 """One bool per row."""
 
 Progress = Callable[[str, float], None]
-"""Progress callback: (name of the stage, fraction done from 0 to 1)."""
+"""Progress callback: (name of the stage, fraction done from 0 to 1). A name may have a detail: `search: pruning`."""
 
 PSNR_CAP = 99.0
 """Largest PSNR, dB, also the PSNR of equal images."""

@@ -59,6 +59,20 @@ def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
     assert "50 %, about 20 s left" in capsys.readouterr().err
 
 
+def test_a_stage_with_a_detail_keeps_its_start_until_it_begins_again(clock, capsys):
+    display = Display(terminal=False, clock=clock)
+    for detail, share, seconds in (("views", 0.0, 20.0), ("refit; best so far 9 kB", 0.5, 20.0), ("file", 0.4, 0.0)):
+        display.report(f"search: {detail}", share)
+        clock.now += seconds
+    display.tick()
+    assert "search 40 %, about 60 s left; file; 0:40 so far" in capsys.readouterr().err
+    display.report("search: views", 0.0)
+    clock.now += 10.0
+    display.report("search: views", 0.5)
+    display.tick()
+    assert "search 50 %, about 10 s left; views" in capsys.readouterr().err
+
+
 def test_a_stage_may_have_its_own_text_and_long_runs_announce_their_time(clock, capsys):
     display = Display(terminal=False, clock=clock)
     with displayed(display), step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:

@@ -73,6 +73,16 @@ def path(data, tmp_path):
     return tmp_path / "levels.csplat"
 
 
+def test_levels_report_the_whole_of_their_work(model):
+    reports = []
+    csplat.encode(model, levels=2, context=Context(progress=lambda stage, done: reports.append((stage, done))))
+    words, fractions = zip(*reports, strict=True)
+    assert {"levels"} == {text.partition(": ")[0] for text in words}
+    assert (0.0, 1.0) == (fractions[0], fractions[-1])
+    fitted = [text for text in dict.fromkeys(words) if "refitting" in text]
+    assert [f"levels: refitting splats of level {level}" for level in (1, 2)] == fitted
+
+
 def quarter(splats):
     return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
 

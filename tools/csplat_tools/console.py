@@ -127,6 +127,7 @@ class _Stage:
 
     begun: float
     done: float = 0.0
+    detail: str = ""
     text: str | None = None
 
 
@@ -152,16 +153,17 @@ class Display:
         """Record the progress of a stage.
 
         Args:
-            stage: its name.
-            done: fraction done, 0 to 1; a smaller fraction than before restarts the stage.
+            stage: its name, or `name: detail`, of which the detail may change from report to report.
+            done: fraction done, 0 to 1; 0, or a smaller fraction than before without a detail, restarts the stage.
             text: text to show instead of percentage and time left.
         """
+        name, _, detail = stage.partition(": ")
         with self._lock:
-            known = self._stages.pop(stage, None)
-            if known is None or done < known.done:
+            known = self._stages.pop(name, None)
+            if known is None or done == 0.0 or (done < known.done and not detail):
                 known = _Stage(self._clock())
-            known.done, known.text = done, text
-            self._stages[stage] = known  # moved to the end of the order
+            known.done, known.detail, known.text = done, detail, text
+            self._stages[name] = known  # moved to the end of the order
 
     def tick(self) -> None:
         """Update the bars, or print a line if one is due."""
@@ -284,18 +286,16 @@ def _ticking_display(*, quiet: bool) -> Iterator[Display | None]:
 
 
 def _stage_text(stage: _Stage, now: float) -> str:
-    """Return the text of a stage: its own, or the percentage that is done, with an estimate of the time left.
+    """Return the text of a stage: its own, or the percentage that is done, the estimated time left, and the detail.
 
     The estimate is left out early in a stage, and the percentage before any progress. `now` is in seconds, as `begun`.
     """
     if stage.text is not None:
         return stage.text
-    if stage.done <= 0.0:
-        return ""
-    share, seconds = f"{100.0 * stage.done:.0f} %", now - stage.begun
-    if stage.done < _ESTIMATE_FROM[0] or seconds < _ESTIMATE_FROM[1]:
-        return share
-    return f"{share}, about {format_seconds(seconds * (1.0 / stage.done - 1.0))} left"
+    words, seconds = [f"{100.0 * stage.done:.0f} %"] if stage.done > 0.0 else [], now - stage.begun
+    if stage.done >= _ESTIMATE_FROM[0] and seconds >= _ESTIMATE_FROM[1]:
+        words.append(f"about {format_seconds(seconds * (1.0 / stage.done - 1.0))} left")
+    return "; ".join(filter(None, (", ".join(words), stage.detail)))
 
 
 def _new_bars() -> Bars:
@@ -304,7 +304,7 @@ def _new_bars() -> Bars:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
 
-    columns = (TextColumn("{task.description:<24}"), BarColumn(), TextColumn("{task.fields[words]}"))
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
     console = Console(stderr=True)
     return Bars(
         *columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False

@@ -15,7 +15,7 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import size_on_disk
 from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, EncodeResult, Target, Views
-from csplat.errors import InputError, counted
+from csplat.errors import InputError, SearchInterrupted, counted
 from csplat.formats import detect_format
 from csplat.model import MAX_SH_DEGREE
 from csplat.out_of_core import EncodingCost, estimate_cost, working_folder
@@ -131,6 +131,8 @@ def encode_file(
         InputError: arguments contradict each other.
         CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
+        SearchInterrupted: Ctrl-C interrupted a search; `best` is the `EncodedFile` of the best file so far, which was
+            written, or `None`.
     """
     whole = target is not None or importance is not None or source_index is not None
     if prune_unseen and importance is None:
@@ -139,7 +141,7 @@ def encode_file(
         raise InputError("prune_unseen and a target are given, expected only one of them")
     if whole and context.is_bounded:
         raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
-    start = time.perf_counter()
+    start, interrupt = time.perf_counter(), None
     with ExitStack() as stack:
         if isinstance(source, Scene):
             scene = source.loaded() if whole else source
@@ -162,25 +164,33 @@ def encode_file(
                     builder, whole = _levels_of_source(local, builder, context), True
                 in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
                 scene = read_source(local, overrides, opened=opened, in_memory=in_memory, **reading)
-        if scene.in_memory is None:
-            result = _encode_on_disk(scene, output, options, builder, context)
-        elif importance is not None:
-            from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
+        try:
+            if scene.in_memory is None:
+                result = _encode_on_disk(scene, output, options, builder, context)
+            elif importance is not None:
+                from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
-            result = encode_by_importance(
-                scene.in_memory, options, importance, target=target, views=views, prune_unseen=prune_unseen,
-                levels=builder, context=context,
-            )  # fmt: skip
-        else:
-            alone = replace(context, memory=None, workers=None, resume=False)  # it fits
-            result = encode_with_report(
-                scene, options, levels=builder, target=target, views=views, context=alone
-            )  # fmt: skip
+                result = encode_by_importance(
+                    scene.in_memory, options, importance, target=target, views=views, prune_unseen=prune_unseen,
+                    levels=builder, context=context,
+                )  # fmt: skip
+            else:
+                alone = replace(context, memory=None, workers=None, resume=False)  # it fits
+                result = encode_with_report(
+                    scene, options, levels=builder, target=target, views=views, context=alone
+                )  # fmt: skip
+        except SearchInterrupted as caught:
+            if caught.best is None:
+                raise
+            result, interrupt = caught.best, caught
         if scene.in_memory is not None:
             write_bytes(output, result.data)
         if source_index is not None:
             write_array(source_index, result.source_index)
-    return EncodedFile(scene, result, time.perf_counter() - start)
+    encoded = EncodedFile(scene, result, time.perf_counter() - start)
+    if interrupt is not None:
+        raise SearchInterrupted(str(interrupt), encoded)
+    return encoded
 
 
 def _surely_fits(path: Path, format: str | None, context: Context) -> bool:

@@ -37,6 +37,7 @@ from csplat.scene import join_blocks
 from csplat.types import F32, I64, null_progress
 from csplat_render.kernels import thread_count
 from csplat_tools.optional_packages import require_renderer
+from csplat_tools.planned_progress import Plan, PlannedProgress, PlannedWork
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
 
@@ -44,6 +45,8 @@ _KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
 # Seconds per splat to build levels and measure their errors: scenes in one piece, and buckets.
 _SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
+# Costs of each report for a splat, in the unit of plans: of buckets, and of coding and measuring levels.
+_BUILDING_COST, _CODING_COST = 4000.0, 100.0
 _ROUNDING = 1e-9  # more than the rounding error of a logarithm, so that an exact power needs no further level
 
 #: A function that makes the splats of a level, and the node of each. Its arguments are as for `LevelFitter.fit`.
@@ -97,6 +100,8 @@ class FittedLevelBuilder:
 
     def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
+        progress = PlannedProgress("levels", self._plan(plan.model), plan.context.progress)
+        plan = replace(plan, context=replace(plan.context, progress=progress))
         nodes = self.build(plan.model, plan.context) if self.nodes is None else self.nodes
         return self.measure(encode_levels(plan, nodes, codebooks), plan.context)
 
@@ -172,6 +177,25 @@ class FittedLevelBuilder:
         from csplat_tools.level_errors import measure_errors
 
         return measure_errors(encoded, context=context)
+
+    def _plan(self, model: SplatModel) -> Plan:
+        """Return the expected work of `encode_plan`."""
+        from csplat_tools.level_fitting import LevelFitter
+
+        phases, count, level = list[dict[str, PlannedWork]](), len(model), 0
+        if self.nodes is None and count > self.whole_splats:
+            buckets = math.ceil(count / self.bucket_splats)
+            phases.append({"building levels": PlannedWork(buckets, self.bucket_splats * _BUILDING_COST)})
+        elif self.nodes is None and count:
+            while count > self.root_splats if self.count is None else level < self.count:
+                finer_count, count, level = count, math.ceil(count / _KEPT), level + 1
+                phases.append(LevelFitter(model).plan(finer_count, count, level))
+        per_stage = _CODING_COST * len(model)
+        return [
+            *phases,
+            {"codebook": PlannedWork(8, per_stage), "tiles": PlannedWork(3, per_stage)},
+            {"measuring levels": PlannedWork(2, per_stage)},
+        ]
 
     @property
     def _part_levels(self) -> int:

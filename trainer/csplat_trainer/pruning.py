@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.model import SplatModel
-from csplat.types import F16, F32, F64, I64, Mask
+from csplat.types import F16, F32, F64, I64, Mask, null_progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
@@ -120,9 +120,14 @@ class PruningOrder:
     def extend(self, *, kept_count: int | None = None, error: float = math.inf) -> None:
         """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
+        done = 1.0
         while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
             if not self._prune_round(max(least, int(len(self._left) * _ROUND_FRACTION))):
                 break
+            done = len(self.rows) / len(self.model)
+            self.context.progress("ordering splats", done)
+        if done < 1.0:
+            self.context.progress("ordering splats", 1.0)
 
     def _prune_round(self, count: int) -> bool:
         """Prune until `count` splats are left, after measuring the next group of views again, but for the first round.
@@ -135,7 +140,8 @@ class PruningOrder:
         if self.rounds:
             turn = (len(self.rounds) - 1) % len(self.groups)  # the groups take turns
             left, cameras = self.model.select(self._left), self.groups[turn].cameras
-            self.groups[turn] = MeasuredViews.of(left, cameras, self.background, context=self.context)
+            quiet = replace(self.context, progress=null_progress)
+            self.groups[turn] = MeasuredViews.of(left, cameras, self.background, context=quiet)
         keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups))
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]

@@ -46,8 +46,8 @@ class Target:
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         max_error: largest error of any splat by measure of the format: means in scene units, covariance relative,
             opacities, sh0 to sh4. Alone it requires no rendering.
-        prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes a
-            sixth of the time.
+        prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes less
+            than half of the time.
         effort: 1 to 9, work of the search: number of views, candidates and refit steps.
 
     Raises:
@@ -165,6 +165,7 @@ class SearchReport:
         pruning_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
         chosen, tried: the chosen file and all candidates.
         why, sure: explanations of the choice, and of the accuracy of the PSNR.
+        interrupted: the search was interrupted, and its best file so far was chosen.
     """
 
     goal: dict[str, Any]
@@ -189,6 +190,7 @@ class SearchReport:
     tried: tuple[dict[str, Any], ...] = ()
     why: tuple[str, ...] = ()
     sure: str = ""
+    interrupted: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""

@@ -17,10 +17,10 @@ import pytest
 from analytic_search import AnalyticScene, analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
 from checked import cloud, measure_errors
-from command_line import call, change_views, invoke
+from command_line import call, change_options, change_views, invoke
 from tables import failures
 
-from csplat import Context, EncodeOptions, InputError, decode, decode_scene, write_ply
+from csplat import Context, EncodeOptions, InputError, SearchInterrupted, decode, decode_scene, encode, write_ply
 from csplat.encode_api import encode_with_report
 from csplat.encoder import Importance, SearchReport, Target, meet_bounds
 from csplat.sizes import parse_size
@@ -31,11 +31,10 @@ from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import parse_max_error
-from csplat_tools.optimise.candidates import WholeScene
+from csplat_tools.optimise.candidates import CandidatePool, WholeScene
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
 from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.target_search import expected_renders
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
@@ -282,14 +281,7 @@ def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
     np.testing.assert_array_equal(weights, complete_importance(scene, views, plain, weights, inside=False)[0].sh)
 
 
-def test_the_expected_renders_depend_on_the_target_and_their_seconds_exclude_the_first(scene):
-    target, options, fast = Target(psnr=30.0), EncodeOptions(), EncodeOptions(preset="fast")
-    most, least = (expected_renders(options, replace(target, prune=prune)) for prune in (True, False))
-    assert 0.0 < least < most
-    assert {least} == {expected_renders(one, target) for one in (fast, EncodeOptions(keep_extra=True))}
-    assert least == expected_renders(options, replace(target, max_error={"means": 1.0}))
-    assert most == expected_renders(fast, Target(keep=0.5))
-    assert most > expected_renders(options, replace(target, effort=1))
+def test_the_time_of_a_render_excludes_the_first(scene):
     views, drawn, now = comparison_cameras(scene), [], [0.0]
 
     def draw(camera):
@@ -371,6 +363,78 @@ def test_the_command_meets_a_size_with_reasons_and_its_share_is_verified(tmp_pat
     call("verify", out, "--source", ply, "--source-index", index)
     call("verify", out, "--source", ply)
     assert "150 pruned" in call("info", out).stdout
+
+
+class CtrlC:
+    """A progress callback that interrupts the search once, when its candidates satisfy a condition."""
+
+    def __init__(self, patch, condition):
+        self.condition, self.pools = condition, []
+        patch.setattr("csplat_tools.optimise.target_search.CandidatePool", self.make_pool)
+
+    def make_pool(self, *arguments):
+        self.pools.append(CandidatePool(*arguments))
+        return self.pools[-1]
+
+    def __call__(self, *_):
+        if self.pools and self.condition(self.pools[-1].made):
+            self.condition = lambda _: False
+            raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+def test_an_interrupted_search_has_the_best_file_so_far_or_says_what_is_near(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("csplat_tools.optimise.target_search.extra_test_cameras", lambda _: {})
+    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", view_size=(960, 720))  # fewer steps
+    out, views = tmp_path / "scene.csplat", judged_by(cameras(40))
+
+    def interrupted(condition, levels=None, **target):
+        context = Context(progress=CtrlC(monkeypatch, condition))
+        with pytest.raises(KeyboardInterrupt) as caught:
+            encode(scene, out=out, target=Target(**target), views=views, levels=levels, context=context)
+        assert caught.type is SearchInterrupted
+        return caught.value
+
+    def is_met(made):
+        return any(file.validation_psnr >= 24.0 for file in made)
+
+    for prune in (False, True):
+        stopped = interrupted(is_met, psnr=24.0, prune=prune, effort=1)
+        report = stopped.best.report.search
+        met = [file for file in report.tried if file["validation_psnr"] >= 24.0]
+        assert [min(met, key=lambda file: file["size_bytes"])["size_bytes"]] == [len(out.read_bytes())]
+        assert (out.read_bytes(), True) == (stopped.best.data, report.interrupted)
+        assert report.psnr == pytest.approx(views.test_scorer(scene).psnr(decode(out)), abs=1e-4)
+        out.unlink()
+    for condition, target, texts in (
+        (lambda made: not made, {"psnr": 24.0}, ("no file was made", "--no-prune or --effort 1")),
+        (lambda made: len(made) == 2, {"psnr": 50.0}, ("no file reaches 50.00 dB; the best found has", " kB; ")),
+        (lambda made: len(made) == 2, {"size": 200, "prune": False}, ("at most 200 bytes; the smallest", " dB; --eff")),
+        (is_met, {"psnr": 24.0, "levels": 1}, ("no file with levels of detail was made; ",)),
+    ):  # fmt: skip
+        stopped = interrupted(condition, effort=1, **target)
+        assert (None, False) == (stopped.best, out.exists())
+        assert [] == [text for text in texts if text not in str(stopped)]
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_best_file_of_an_interrupted_search_and_its_report(tmp_path, ply, monkeypatch):
+    out, report = tmp_path / "scene.csplat", tmp_path / "report.json"
+    save_cameras(tmp_path / "cameras.json", cameras(40))
+    words = ("encode", ply, out, "--target-size", "5kB", "--cameras", tmp_path / "cameras.json", "--no-prune")
+
+    def is_met(made):
+        return any(file.size_bytes <= 5000 for file in made)
+
+    for condition, tried in ((lambda made: not made, 0), (is_met, 1)):
+        change_options(monkeypatch, "csplat_tools.cli.encode.Context", progress=CtrlC(monkeypatch, condition))
+        stopped = call(*words, "--report", report, status=130)
+        assert (tried > 0, tried > 0) == (out.exists(), report.exists())
+        assert "interrupted: " in stopped.stderr.splitlines()[-1]
+    target = json.loads(report.read_text())["target"]
+    assert (True, out.stat().st_size) == (target["interrupted"], target["size_bytes"])
+    assert out.stat().st_size <= 5000
+    call("verify", out)
 
 
 def test_only_long_work_is_announced(capsys):

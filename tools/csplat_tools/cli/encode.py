@@ -10,6 +10,7 @@ import typer
 import csplat
 from csplat.context import Context
 from csplat.encoder import EncodeOptions, Target
+from csplat.errors import SearchInterrupted
 from csplat.model import SplatModel
 from csplat.out_of_core import estimate_cost
 from csplat.scene import Scene
@@ -93,11 +94,12 @@ def encode(
     for archives, small if size matters more than precision. One of
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
     chooses the precision and prunes splats; it goes on as long as it expects to
-    save 1 % of the bytes per 10 CPU seconds. --max-error limits errors of means,
-    covariance, opacities, sh0 to sh4. Views are virtual without --data, which
-    requires the render extra, or --cameras. --levels adds coarser versions of
-    the scene, which viewers show first: 35 % more bytes, and minutes. --help-all
-    shows --keep, --cameras, --up and all other options.
+    save 1 % of the bytes per 10 CPU seconds, and Ctrl-C takes the best file so
+    far that meets the target. --max-error limits errors of means, covariance,
+    opacities, sh0 to sh4. Views are virtual without --data, which requires the
+    render extra, or --cameras. --levels adds coarser versions of the scene,
+    which viewers show first: 35 % more bytes, and minutes. --help-all shows
+    --keep, --cameras, --up and all other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
@@ -152,11 +154,16 @@ def encode(
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                view_set = _find_views(scene.model(), options, target, views, out, context)
-        encoded = encode_file(
-            scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
-            source_index=source_index, levels=level_count, format=read_as, context=context,
-        )  # fmt: skip
+                view_set = _find_views(scene.model(), options, target, views, level_count, out, context)
+        try:
+            encoded = encode_file(
+                scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
+                source_index=source_index, levels=level_count, format=read_as, context=context,
+            )  # fmt: skip
+        except SearchInterrupted as interrupt:
+            if interrupt.best is not None:
+                _publish_encoded(interrupt.best, source, output, out, up=up)
+            raise
         _publish_encoded(encoded, source, output, out, up=up)
         if level_count is None:
             written = encoded.source.changed(count=encoded.result.report.splat_count)
@@ -205,17 +212,22 @@ def _find_views(
     options: EncodeOptions,
     target: Target,
     views: shared.ViewOptions,
+    levels: LevelCount,
     out: Output,
     context: Context,
 ) -> ViewSet:
     """Find the views of a scene, and announce how long the search will take."""
     from csplat_tools.optimise.target_encoding import expected_search_seconds
 
+    context.progress("placing views", 0.0)
     view_set = views.find(model, out)
     if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
         out.announce_time(
-            lambda: expected_search_seconds(model, options, target, view_set, context),
-            "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
+            lambda: expected_search_seconds(
+                model, options, target, view_set, has_levels=levels is not None, context=context
+            ),
+            "--no-prune takes less than half of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
+    context.progress("placing views", 1.0)
     return view_set

@@ -88,8 +88,8 @@ def report_errors() -> Iterator[None]:
         _fail(_describe_os_error(error), errno.errorcode.get(error.errno or 0, ""))
     except MemoryError:
         _fail("out of memory", "")
-    except KeyboardInterrupt:
-        note("interrupted")
+    except KeyboardInterrupt as interrupt:
+        note(str(interrupt) or "interrupted")
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 

@@ -7,16 +7,13 @@ from typing import Annotated
 import typer
 
 from csplat.context import Context
+from csplat.errors import SearchInterrupted
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name, write_model
 from csplat_tools.inspect.text_reports import format_simplification
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import load_scene
-
-#: Cost in renders of all training views: for --keep, and for a target, which searches for the fraction to keep. Half of
-#: the cost is fitting.
-_PASSES = (20.0, 45.0)
 
 
 def simplify(
@@ -40,7 +37,8 @@ def simplify(
     Splats are fitted to training views, validation views decide how many are
     kept, and test views score the result. --max-psnr-drop requires --data.
     `csplat encode` with a target does the same for the file that it writes.
-    --data requires the render extra.
+    Ctrl-C takes the fewest splats so far that meet the target. --data requires
+    the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -56,9 +54,8 @@ def simplify(
         raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
+    from csplat_tools.optimise.search_plan import plan_seconds, simplify_plan
     from csplat_tools.optimise.simplify import SimplifyOptions
-    from csplat_tools.views import shrink_cameras
-    from csplat_tools.views.view_sets import total_render_seconds
 
     options = SimplifyOptions(effort=target.effort)
     out.check(output, inputs=(source, *views.inputs))
@@ -67,15 +64,21 @@ def simplify(
         read = load_scene(source)
         out.print_findings(read.findings)
         model = overrides.apply_to_model(read.model())
+        progress("placing views", 0.0)
         view_set = views.find(model, out)
-        passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
-        size = options.views_and_size(len(model))[1]
-        out.announce_time(
-            lambda: passes * total_render_seconds(model, shrink_cameras(view_set.training, size)),
-            "--effort 1 takes less",
-        )
+        plan = simplify_plan(options.pruner(model, view_set), target)
+        out.announce_time(lambda: plan_seconds(plan, model, view_set), "--effort 1 takes less")
+        progress("placing views", 1.0)
         context = Context(progress=progress)
-        result = csplat_tools.simplify(model, target, views=view_set, options=options, context=context)
+        interrupt = None
+        try:
+            result = csplat_tools.simplify(model, target, views=view_set, options=options, context=context)
+        except SearchInterrupted as caught:
+            if caught.best is None:
+                raise
+            result, interrupt = caught.best, caught
     write_model(output, result.model, absolute=False)
     out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)
+    if interrupt is not None:
+        raise interrupt

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 _FEW_VIEWS = 12  # validation views in which drafts are compared, at least
 
+#: Stages of progress: a draft, which skips the refit through the quantisers; another file; levels of detail of a file.
+DRAFT, FILE, LEVELS = "encoding a draft", "encoding a file", "building levels"
+
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
 
@@ -265,7 +268,7 @@ class CandidatePool:
             is_alike = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes
             if is_alike and candidate.options == options and candidate.is_draft == draft:
                 return candidate
-        report, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
+        report, stage = self.progress or null_progress, DRAFT if draft else FILE
         report(stage, 0.0)
         coded = subset.encode(options, use_classes=coding.use_classes, draft=draft)
         result = coded.write()
@@ -281,6 +284,8 @@ class CandidatePool:
 
         Its tiles differ from the tiles that the splats were refitted for, so its error is larger.
         """
+        report = self.progress or null_progress
+        report(LEVELS, 0.0)
         coded = candidate.coded
         entries = {"levels": levels.settings(len(coded.plan.model))}
         encoded = levels.encode_plan(coded.plan, coded.codebooks)
@@ -288,6 +293,7 @@ class CandidatePool:
             encoded = replace(encoded, errors=coded.errors)
         error = self.error(self.decode(encoded.write(entries).data), exact=True)
         result = encoded.write({**(candidate.subset.metadata(psnr_of_mse(error)) or {}), **entries})
+        report(LEVELS, 1.0)
         return replace(
             candidate, coded=encoded, result=result, error=error, is_exact=True, image_error=None, test_psnr=None
         )

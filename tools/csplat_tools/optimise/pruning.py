@@ -168,6 +168,14 @@ class Pruner:
         self._last = PrunedSubset(self, model, rows, psnr_pruned, psnr, is_refused)
         return self._last
 
+    def planned_steps(self, files: float) -> tuple[float, float]:
+        """Return the numbers of steps of the refits of a search, and those through the quantisers of some files."""
+        later = _STEPS // (2 if self.use_classes else 1)
+        return (
+            sum(self.scaled_steps(part * _STEPS) for part, _ in REFITS),
+            self.scaled_steps(_STEPS) + (files - 1.0) * self.scaled_steps(later),
+        )
+
     def scaled_steps(self, usual: float) -> int:
         """Return a number of steps, times `steps_factor`, at least 1."""
         return max(1, round(usual * self.steps_factor))

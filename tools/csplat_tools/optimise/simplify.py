@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,15 +13,18 @@ import numpy as np
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Target
-from csplat.errors import InputError
+from csplat.errors import InputError, SearchInterrupted, counted
 from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.types import I64
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import psnr_of_mse
+from csplat_render.scorer import Scorer
 from csplat_tools.optimise.pruning import REFITS, PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import AIM, LOG_ERROR_PER_DB, NOTHING, error_of_psnr
+from csplat_tools.optimise.search_plan import SCORES, simplify_plan
 from csplat_tools.optional_packages import require_renderer
+from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
@@ -132,6 +136,8 @@ def simplify(
             or even the source misses the target.
         CsplatError: the scene is not valid.
         OSError: the file cannot be read.
+        SearchInterrupted: Ctrl-C interrupted the search for a PSNR; `best` has the fewest splats so far that reach it,
+            or is `None`.
     """
     require_renderer()
     target.require("simplify", "keep", "psnr", "max_psnr_drop")
@@ -144,25 +150,35 @@ def simplify(
     if views is None:
         count, size = options.views_and_size(len(source))
         views = find_view_set(source, background=options.background, count=count, size=size, seed=context.seed)
+    plan = simplify_plan(options.pruner(source, views), target)
+    progress = PlannedProgress("search", plan, context.progress)
+    context = replace(context, progress=progress)
     pruner, scores = options.pruner(source, views, context=context), dict[str, Any]()
     if target.keep is not None:
         subset = pruner.refit(target.count(len(source)))
     else:
-        subset, scores = _prune_to_psnr(pruner, target)
+        subset, scores = _prune_to_psnr(pruner, target, progress)
+    progress(SCORES, 0.0)
     report = {**_pruning_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
+    progress(SCORES, 1.0)
     report["seconds"] = round(time.perf_counter() - start, 2)
     notes = (_NOT_PRUNED,) if target.keep is None and len(subset.rows) == len(source) else ()
-    return Simplified(subset.model, subset.rows, report, notes)
+    simplified = Simplified(subset.model, subset.rows, report, notes)
+    if "interrupted" in report:
+        splats, psnr = counted(len(subset.model), "splat"), report["validation_psnr"]
+        raise SearchInterrupted(f"interrupted: the best so far was taken, {splats} with {psnr:.2f} dB", simplified)
+    return simplified
 
 
-def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, float]]:
-    """Return the fewest splats that reach a PSNR on validation views, and their PSNR for the report, dB.
+def _prune_to_psnr(pruner: Pruner, target: Target, progress: PlannedProgress) -> tuple[PrunedSubset, dict[str, Any]]:
+    """Return the fewest splats that reach a PSNR on validation views, and entries for the report: their PSNR, dB.
 
     For a drop, the PSNR is against images, otherwise against renders of the source. Each number is predicted from the
     pruning order and the last refit. All splats are kept, without a refit, if no refit reaches it.
 
     Raises:
         InputError: even the source misses the PSNR.
+        SearchInterrupted: Ctrl-C, and no refit so far reaches the PSNR; else `interrupted` is among the entries.
     """
     source, views = pruner.source, pruner.views
     scorer = views.validation_scorer(source, context=pruner.context)
@@ -173,9 +189,33 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
     assert goal is not None
     if psnr_of_mse(source_error) < goal:
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
-    allowed = error_of_psnr(goal)
-    added_max = allowed - source_error  # largest mean squared error that pruning may add
-    refits = list[tuple[float, PrunedSubset]]()  # with the mean squared error
+    allowed, refits = error_of_psnr(goal), list[tuple[float, PrunedSubset]]()
+    entries = dict[str, Any]()
+    progress.note = lambda: _describe_fewest(refits, allowed)
+    try:
+        _add_refits(refits, pruner, scorer, source_error, allowed)
+    except KeyboardInterrupt:
+        if all(error > allowed for error, _ in refits):
+            raise SearchInterrupted(_nearest_message(refits, goal)) from None
+        entries["interrupted"] = True
+    reached = [refit for refit in refits if refit[0] <= allowed] or [(source_error, pruner.refit(len(source)))]
+    error, subset = min(reached, key=lambda refit: len(refit[1].rows))
+    return subset, {"validation_psnr": psnr_of_mse(error), **entries}
+
+
+def _add_refits(
+    refits: list[tuple[float, PrunedSubset]], pruner: Pruner, scorer: Scorer, source_error: float, allowed: float
+) -> None:
+    """Add refits of the search for a mean squared error to a list, with their errors, until one is on the goal.
+
+    Args:
+        refits: the list, empty.
+        pruner: prunes and refits the source.
+        scorer: scorer on the validation views.
+        source_error: mean squared error of the source; 0 against its own renders.
+        allowed: mean squared error to reach.
+    """
+    splats, added_max = len(pruner.source), allowed - source_error  # largest mean squared error that pruning may add
     known: tuple[int, float] | None = None  # number of splats of the last refit, and the error that another would add
     schedule = list(REFITS) if pruner.refits else []
     while True:
@@ -183,21 +223,36 @@ def _prune_to_psnr(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[s
         kept_count = next_value(
             math.log(added_max),
             [(len(subset.rows), math.log(max(error - source_error, NOTHING))) for error, subset in refits],
-            partial(np.interp, xp=counts, fp=np.log(np.maximum(errors, NOTHING))), bounds=(counts[0], len(source)),
+            partial(np.interp, xp=counts, fp=np.log(np.maximum(errors, NOTHING))), bounds=(counts[0], splats),
             margin=0.5 * AIM * LOG_ERROR_PER_DB, tolerance=AIM * LOG_ERROR_PER_DB * allowed / added_max, least_step=1.0,
             tries=_TRIES,
         )  # fmt: skip
-        if kept_count is None or math.ceil(kept_count) == len(source):
-            break
+        if kept_count is None or math.ceil(kept_count) == splats:
+            return
         part, rest_gain = schedule.pop(0) if schedule else REFITS[-1]
         subset = pruner.refit(math.ceil(kept_count), part)
         error = scorer.pooled(scorer.errors(subset.model))
         known = len(subset.rows), error_of_psnr(rest_gain) * max(error - source_error, 0.0)
         if part == REFITS[-1][0] or not pruner.refits:  # others gain more than this one would
             refits.append((error, subset))
-    reached = [refit for refit in refits if refit[0] <= allowed] or [(source_error, pruner.refit(len(source)))]
-    error, subset = min(reached, key=lambda refit: len(refit[1].rows))
-    return subset, {"validation_psnr": psnr_of_mse(error)}
+
+
+def _describe_fewest(refits: Sequence[tuple[float, PrunedSubset]], allowed: float) -> str:
+    """Describe the fewest splats so far of at most this mean squared error, for progress; empty if there are none."""
+    reached = [(len(subset.rows), error) for error, subset in refits if error <= allowed]
+    if not reached:
+        return ""
+    count, error = min(reached)
+    return f"best so far {counted(count, 'splat')}, {psnr_of_mse(error):.1f} dB"
+
+
+def _nearest_message(refits: Sequence[tuple[float, PrunedSubset]], goal: float) -> str:
+    """Return the message if the search for a PSNR in dB is interrupted before a refit reaches it."""
+    found = "nothing was refitted"
+    if refits:
+        error, subset = min(refits, key=lambda refit: refit[0])
+        found = f"{counted(len(subset.rows), 'splat')} have {psnr_of_mse(error):.2f} dB"
+    return f"interrupted: no pruned scene reaches {goal:.2f} dB so far; {found}; --effort 1 takes less time"
 
 
 def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Target, meet_bounds
-from csplat.errors import InputError
+from csplat.errors import InputError, SearchInterrupted, counted
 from csplat.model import SplatModel
+from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optional_packages import require_renderer
-from csplat_tools.views import ViewSet, find_view_set
-from csplat_tools.views.view_sets import render_seconds
+from csplat_tools.views import ViewSet, find_view_set, with_validation_views
 
 if TYPE_CHECKING:
     from csplat_tools.level_builder import FittedLevelBuilder
@@ -47,6 +47,7 @@ def meet_target(
     Raises:
         InputError: the renderer is not installed, there are no splats, an option is set that the target determines, or
             the target is out of reach.
+        SearchInterrupted: Ctrl-C interrupted the search; `best` is the best file so far that meets the target, if any.
     """
     start = time.perf_counter()
     require_renderer()
@@ -68,13 +69,27 @@ def meet_target(
         options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, context=context,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
-    return chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
+    result = chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
+    if report.interrupted:
+        files, size = counted(report.encodes, "file"), format_bytes(chosen.size_bytes)
+        raise SearchInterrupted(
+            f"interrupted: the best of {files} so far was taken, {size} with {chosen.validation_psnr:.2f} dB", result
+        )
+    return result
 
 
 def expected_search_seconds(
-    source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet, context: Context = DEFAULT_CONTEXT
+    source: SplatModel,
+    options: EncodeOptions,
+    target: Target,
+    views: ViewSet,
+    *,
+    has_levels: bool = False,
+    context: Context = DEFAULT_CONTEXT,
 ) -> float:
     """Estimate the seconds of `meet_target` on this machine, from the time of some renders of test views."""
-    from csplat_tools.optimise.target_search import expected_renders
+    from csplat_tools.optimise.search_plan import plan_seconds, search_plan
+    from csplat_tools.optimise.simplify import SimplifyOptions
 
-    return expected_renders(options, target) * render_seconds(source, views.test, context=context)
+    pruner = SimplifyOptions(effort=target.effort).pruner(source, with_validation_views(views))
+    return plan_seconds(search_plan(pruner, target, options, has_levels=has_levels), source, views, context)

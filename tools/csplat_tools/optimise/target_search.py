@@ -33,7 +33,7 @@ import numpy as np
 from csplat.context import Context
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
-from csplat.errors import InputError
+from csplat.errors import InputError, SearchInterrupted
 from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.scene import drop_bands
@@ -61,13 +61,11 @@ from csplat_tools.optimise.rate_distortion import (
     rate_exponent,
 )
 from csplat_tools.optimise.scene_sensitivity import MANY_SPLATS, complete_importance
+from csplat_tools.optimise.search_plan import SCORES, keeps_all, search_plan
 from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
-
-# Cost of meeting a target, in renders of one test view.
-_SEARCH_RENDERS = 520.0  # search of an encoding; does not depend on the effort
-_PRUNING_RENDERS = 2480.0  # pruning at the default effort
 
 # Typical values; pairs are without and with SH.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
@@ -143,6 +141,7 @@ class TargetSearch:
         whole: all splats.
         pruner: prunes splats; `None`: all are kept.
         work: amount of work relative to the default effort.
+        with_levels: files with levels of detail, with the log of the factor of their goal; `None`: none are requested.
         _errors: mean squared error before quantisation, by subset and SH degree.
     """
 
@@ -151,6 +150,7 @@ class TargetSearch:
     whole: WholeScene
     pruner: Pruner | None
     work: float = 1.0
+    with_levels: list[tuple[float, Candidate]] | None = None
     _errors: dict[tuple[Subset, int], float] = field(default_factory=dict, init=False)
 
     def best(self) -> Candidate:
@@ -172,11 +172,7 @@ class TargetSearch:
                     break
                 subset = another
                 self._draft_cost(subset, coding, {})
-        is_size = self.goal.size_bytes is not None
-        for candidate in sorted(self.pool.made, key=lambda made: made.error if is_size else made.size_bytes):
-            if self._is_met(candidate):
-                return candidate
-        raise InputError(self._unreached_message())
+        return self._chosen()
 
     def best_with_levels(self, levels: FittedLevelBuilder) -> Candidate:
         """Return the best file with levels of detail, whose bytes count for a size.
@@ -188,7 +184,7 @@ class TargetSearch:
             InputError: no file meets the goal.
         """
         goal, is_size = self.goal, self.goal.size_bytes is not None
-        made = list[tuple[float, Candidate]]()  # with the log of the factor of the goal
+        made = self.with_levels = list[tuple[float, Candidate]]()
         near = _WORTH / self._bytes_per_db * self._log_result_per_db
         log_level_0 = math.log(_LEVEL_0) if is_size else 0.0  # other levels are expected to add bytes, but no error
         while True:
@@ -202,20 +198,11 @@ class TargetSearch:
             factor = math.exp(log_factor)
             error = goal.source_error + factor * (goal.error - goal.source_error)
             size_bytes = None if goal.size_bytes is None else max(1, int(factor * goal.size_bytes))
-            without = replace(self, goal=replace(goal, size_bytes=size_bytes, error=error))
+            without = replace(self, goal=replace(goal, size_bytes=size_bytes, error=error), with_levels=None)
             file = self.pool.with_levels(without.best(), levels)
             self._measure_image_error(file)
             made.append((log_factor, file))
-        met = [file for _, file in made if self._is_met(file)]
-        if met:
-            return min(met, key=lambda file: file.error if is_size else file.size_bytes)
-        if is_size:
-            smallest = min(file.size_bytes for _, file in made)
-            raise InputError(
-                f"no file with levels of detail has at most {goal.size_bytes} bytes; the smallest has {smallest}"
-            )
-        best = max(file.validation_psnr for _, file in made)
-        raise InputError(f"no file with levels of detail reaches the target; the best has {best:.2f} dB")
+        return self._chosen()
 
     def finest(self) -> Candidate | None:
         """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
@@ -632,20 +619,59 @@ class TargetSearch:
                     self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False)
                 )
 
+    def best_so_far(self) -> Candidate | None:
+        """Return the best file of those made so far that meet the goal, or `None` if none does."""
+        is_size = self.goal.size_bytes is not None
+        best_first = sorted(self._files, key=lambda file: file.error if is_size else file.size_bytes)
+        return next((file for file in best_first if self._is_met(file)), None)
+
+    def describe_best(self) -> str:
+        """Describe the best file so far that meets the goal, for progress; empty if there is none."""
+        met = [file for file in self._files if file.is_exact and self._is_met(file)]
+        best = min(met, key=lambda file: file.size_bytes, default=None)
+        return f"best so far {format_bytes(best.size_bytes)}, {best.validation_psnr:.1f} dB" if best else ""
+
+    def interrupted_message(self) -> str:
+        """Return the message if the search is interrupted before any file meets the goal: the nearest, and a remedy."""
+        so_far = self._unreached_message() if self._files else f"no file{self._kind} was made"
+        faster = "--effort 1 takes" if self.pruner is None else "--no-prune or --effort 1 takes"
+        return f"interrupted: so far, {so_far}; {faster} less time, --preset small without a target takes seconds"
+
+    def _chosen(self) -> Candidate:
+        """Return the best file that meets the goal.
+
+        Raises:
+            InputError: no file meets the goal.
+        """
+        chosen = self.best_so_far()
+        if chosen is None:
+            raise InputError(self._unreached_message())
+        return chosen
+
+    @property
+    def _files(self) -> list[Candidate]:
+        """The files that can be compared with the goal, with levels of detail if these are requested."""
+        files = self.pool.made if self.with_levels is None else [file for _, file in self.with_levels]
+        return [file for file in files if self.goal.images is None or file.image_error is not None]
+
+    @property
+    def _kind(self) -> str:
+        """The kind of the requested file, for messages: nothing, or levels of detail."""
+        return "" if self.with_levels is None else " with levels of detail"
+
     def _unreached_message(self) -> str:
-        """Return the error message if no candidate meets the goal, with the best candidate's size or PSNR."""
-        goal, made = self.goal, self.pool.made
+        """Return the error message if no file meets the goal, with PSNR and size of the nearest file."""
+        goal = self.goal
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
-            smallest = min(candidate.size_bytes for candidate in made)
-            return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
-        if goal.images is not None:
-            best = psnr_of_mse(min(file.image_error for file in made if file.image_error is not None))
-            return (
-                f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
-            )
-        best = psnr_of_mse(min(file.error for file in made))
-        return f"no file reaches {psnr_of_mse(goal.error):.2f} dB; the best found has {best:.2f} dB"
+            nearest = min(self._files, key=lambda file: file.size_bytes)
+            found = f"the smallest found has {nearest.size_bytes}, and {nearest.validation_psnr:.2f} dB"
+            return f"no file{kept}{self._kind} has at most {goal.size_bytes} bytes; {found}"
+        nearest = min(self._files, key=lambda file: file.error if file.image_error is None else file.image_error)
+        error = nearest.error if nearest.image_error is None else nearest.image_error
+        where = "" if goal.images is None else " on the validation images"
+        found = f"the best found has {psnr_of_mse(error):.2f} dB, and {format_bytes(nearest.size_bytes)}"
+        return f"no file{self._kind} reaches {psnr_of_mse(goal.error):.2f} dB{where}; {found}"
 
 
 def _clipped(quality: float) -> float:
@@ -679,8 +705,13 @@ def search_target(
 
     Raises:
         InputError: the target is out of reach, no splat is visible, or a drop of PSNR is requested without images.
+        SearchInterrupted: the search was interrupted, and no file so far meets the target. If one does, the best is
+            returned, and `interrupted` is set in the report.
     """
     views = with_validation_views(views)
+    plan = search_plan(options.pruner(source, views), target, encoding, has_levels=levels is not None)
+    progress = PlannedProgress("search", plan, context.progress)
+    context = replace(context, progress=progress)
     test_scorer = views.test_scorer(source, context=context)
     if views.name != VIRTUAL and _is_empty(test_scorer):
         raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
@@ -692,22 +723,33 @@ def search_target(
     pool = CandidatePool(encoding, views.validation_scorer(source, context=context), context.progress)
     images = None if target.max_psnr_drop is None else views.image_validation_scorer(context=context)
     goal, whole = Goal.of(target, source, images), WholeScene(source, importance, None, context)
-    finest = None if levels is not None else TargetSearch(goal, pool, whole, None).finest()
-    if finest is None and not _keeps_all(target, encoding):
-        pruner = options.pruner(source, views, use_classes=not inside, context=context)
-    if finest is not None:
-        chosen = finest
-    elif pruner is not None and target.keep is not None:
-        chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
-        chosen = chosen if levels is None else pool.with_levels(chosen, levels)
-    else:
-        if pruner is None:
-            measured, sensitivity_views = complete_importance(
-                source, views, encoding, importance, inside=inside, context=context
-            )
-            whole = replace(whole, measured=measured)
-        search = TargetSearch(goal, pool, whole, pruner, options.work)
-        chosen = search.best() if levels is None else search.best_with_levels(levels)
+    search = TargetSearch(goal, pool, whole, None, options.work, None if levels is None else [])
+    progress.note = search.describe_best
+    finest, interrupted = None, False
+    try:
+        finest = None if levels is not None else search.finest()
+        if finest is None and not keeps_all(target, encoding):
+            pruner = search.pruner = options.pruner(source, views, use_classes=not inside, context=context)
+        if finest is not None:
+            chosen = finest
+        elif pruner is not None and target.keep is not None:
+            chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
+            chosen = chosen if levels is None else pool.with_levels(chosen, levels)
+        else:
+            if pruner is None:
+                measured, sensitivity_views = complete_importance(
+                    source, views, encoding, importance, inside=inside, context=context
+                )
+                search.whole = replace(whole, measured=measured)
+            chosen = search.best() if levels is None else search.best_with_levels(levels)
+    except KeyboardInterrupt:
+        if target.keep is not None:  # its only file is not complete
+            raise
+        best, interrupted = search.best_so_far(), True
+        if best is None:
+            raise SearchInterrupted(search.interrupted_message()) from None
+        chosen = best
+    progress(SCORES, 0.0)
     remarks = [_INSIDE_REMARK] if inside and chosen.splats < len(source) else []
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
@@ -715,24 +757,14 @@ def search_target(
         target, chosen, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
         encodes=len(pool.made), seconds=0.0,
         images=_image_psnr(source, chosen, views, context) if views.images else {},
-        sensitivity_views=sensitivity_views, pruning_views=0 if pruner is None else pruner.view_count,
-        elsewhere=_psnr_elsewhere(source, chosen, views, context),
+        sensitivity_views=sensitivity_views,
+        pruning_views=0 if pruner is None or chosen.subset is whole else pruner.view_count,
+        elsewhere={} if interrupted else _psnr_elsewhere(source, chosen, views, context),
         reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
+        interrupted=interrupted,
     )  # fmt: skip
+    progress(SCORES, 1.0)
     return chosen, report
-
-
-def expected_renders(encoding: EncodeOptions, target: Target) -> float:
-    """Return the approximate cost of meeting a target, in renders of one test view."""
-    if _keeps_all(target, encoding):
-        return _SEARCH_RENDERS
-    return _SEARCH_RENDERS + _PRUNING_RENDERS * SimplifyOptions(effort=target.effort).work
-
-
-def _keeps_all(target: Target, encoding: EncodeOptions) -> bool:
-    """Return True if no splat may be pruned, due to the target, error bounds, extra columns or the preset `fast`."""
-    blocked = not target.prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
-    return target.keep is None and blocked
 
 
 def check_target(source: SplatModel, target: Target, encoding: EncodeOptions) -> None:
