@@ -300,7 +300,7 @@ class _Removal(Pruner):
     def order(self):
         return _Order(self.scene)
 
-    def refit(self, kept_count, part=1.0):
+    def refit(self, kept_count, part=2.0):
         model = self.source.select(self.order.kept(kept_count))
         gain = self.scene.mended
         refitted = (gain - 1.5 * (part == 0.25)) / gain  # another refit gains 1.5 dB after a brief one

@@ -134,7 +134,7 @@ def test_a_refit_that_overfits_and_pruning_that_misses_the_target_are_discarded(
     def darker(model, *_arguments, **_options):
         return replace(model, sh0=model.sh0 - np.float32(10.0))
 
-    def refit_darker(pruner, count, part=1.0):
+    def refit_darker(pruner, count, part=2.0):
         refit = one_refit(pruner, count, part)
         return refit if count == len(source) else replace(refit, model=darker(refit.model))
 

@@ -38,9 +38,9 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit through the quantisers
-#: Refits that settle the number of splats: part of the usual steps, and dB that later ones gain, up to those of a file.
-#: In four scenes, a refit after two brief ones gains 1.1 to 2.4 dB.
-REFITS = ((0.25, 2.8), (0.25, 2.3), (1.0, 0.8), (0.5, 0.6))
+#: Refits that settle the number of splats: steps as a multiple of the usual number, and dB that later ones gain, up to
+#: those of a file. In four scenes, a refit after two brief ones gains 1.1 to 2.4 dB.
+REFITS = ((0.25, 2.8), (0.25, 2.3), (2.0, 0.4), (0.5, 0.3))
 REFIT_GAIN = 8.0  # dB by which a refit at least reduces the error of pruning
 
 
@@ -137,15 +137,15 @@ class Pruner:
         errors = self.order.mean_errors()
         return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), NOTHING)
 
-    def refit(self, kept_count: int, part: float = 1.0) -> PrunedSubset:
+    def refit(self, kept_count: int, part: float = 2.0) -> PrunedSubset:
         """Return the kept splats, refitted to renders of the source, unless that makes held-out views worse.
 
-        A refit starts from the values that the previous call returned, so the result depends on earlier calls. A first
-        refit has twice the steps. Nothing is refitted if all splats are kept or `refits` is False.
+        A refit starts from the values that the previous call returned, so the result depends on earlier calls. Nothing
+        is refitted if all splats are kept or `refits` is False.
 
         Args:
             kept_count: number of splats to keep.
-            part: number of steps as a part of the usual number; below 1, a first refit does not have twice the steps.
+            part: number of steps as a multiple of the usual number.
         """
         rows = self.order.kept(kept_count)
         pruned = self.source.select(rows)
@@ -153,14 +153,12 @@ class Pruner:
         if not self.refits or len(rows) == len(self.source):
             self._last = PrunedSubset(self, pruned, rows, psnr_pruned, psnr_pruned, refit_refused=False)
             return self._last
-        start, steps = pruned, part * _STEPS
+        start = pruned
         if self._last is not None:
             start = _with_values_of(self._last.model, self._last.rows, pruned, rows)
-        elif part == 1.0:
-            steps *= 2
         refitted = refit_splats(
-            start, self.cameras, self.references, steps=self.scaled_steps(steps), background=self.views.background,
-            context=self.context,
+            start, self.cameras, self.references, steps=self.scaled_steps(part * _STEPS),
+            background=self.views.background, context=self.context,
         )  # fmt: skip
         psnr_refitted = self.check_scorer.psnr(refitted)
         is_refused = psnr_refitted < psnr_pruned

@@ -236,7 +236,7 @@ class TargetSearch:
                 coding = self._choose_coding(subset, len(self._first_codings(subset)))
             previous_count, kept_count = kept_count, self._best_count(pruner, subset, rest_gain, coding)
             is_near = abs(kept_count - previous_count) <= _WORTH * kept_count
-            is_whole = part == 1.0 or len(subset.model) == len(self.whole.model)
+            is_whole = part > 1.0 or len(subset.model) == len(self.whole.model)
             turn += 1
             if turn == len(REFITS) or (is_near and is_whole):
                 return subset, self._choose_coding(subset, self._most_codings(subset))
