@@ -20,7 +20,8 @@ from csplat.encoder.coding_parameters import CodingParameters, band_slice
 from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import signed_stream, trial_settings
-from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric, run_blocks
+from csplat.encoder.entry_search import run_blocks
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
 from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_values, lift_colour, quantise_sh
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
