@@ -28,7 +28,14 @@ from csplat.encoder.quantisation import (
     quat_levels,
     quat_values,
 )
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodebook, ShCodingPlan, make_codebooks, sh_coarseness
+from csplat.encoder.sh_codebook import (
+    FileCodebooks,
+    ShCodebook,
+    ShCodingPlan,
+    assign_splats,
+    make_codebooks,
+    sh_coarseness,
+)
 from csplat.encoder.shape_codebook import ShapeCodebook, dequantise_shapes
 from csplat.encoder.tiling import dequantise_means, dequantise_opacities, quantise_and_sort
 from csplat.errors import InputError
@@ -284,7 +291,10 @@ def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> Fixe
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
     plan = replace(_reorder(plan, order, [len(part) for part in rows]), parameters=parameters)
-    sh_plan, means = codebooks.sh_plan.select(order), plan.model.means
+    sh_plan, means = codebooks.sh_plan, plan.model.means
+    sh_plan = (
+        assign_splats(sh_plan, plan.model, parameters, plan.context) if sh_plan.of_sample else sh_plan.select(order)
+    )
     low, high = np.empty_like(means), np.empty_like(means)
     for tile in plan.tiles:
         low[tile.rows], high[tile.rows] = means[tile.rows].min(axis=0), means[tile.rows].max(axis=0)
