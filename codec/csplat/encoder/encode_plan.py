@@ -116,7 +116,7 @@ class EncodePlan:
             importance: [N] weights >= 0 of the splats, or an `Importance`; default: guessed from opacity and size.
             origin: the source of the scene; `None`: the scene itself.
             allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
-            contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
+            contrast: contrast of the scene that the model is a sample of; see `contrast_of`.
             context: see `EncodePlan`.
 
         Raises:
@@ -132,7 +132,7 @@ class EncodePlan:
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
-            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats), options, origin, context)
+            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats, context), options, origin, context)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
