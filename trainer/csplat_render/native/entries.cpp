@@ -32,11 +32,11 @@ int32_t pair_at(const int16_t* row, int64_t pair) {
 struct Rows {
   int64_t count, pairs;
   std::vector<int16_t> data;     // [count + kTogether - 1, 2 · pairs], zeros at the end
-  std::vector<int64_t> squares;  // [count], squared norms of the values
+  std::vector<int64_t> squares;  // [count + kTogether - 1], squared norms of the values, zeros at the end
 
   // Copies values [count, width], multiplied by a factor.
   Rows(const int16_t* values, int64_t count, int64_t width, int factor)
-      : count(count), pairs((width + 1) / 2), data((count + kTogether - 1) * 2 * pairs), squares(count) {
+      : count(count), pairs((width + 1) / 2), data((count + kTogether - 1) * 2 * pairs), squares(count + kTogether - 1) {
     for (int64_t n = 0; n < count; n++)
       for (int64_t i = 0; i < width; i++, values++) {
         data[n * 2 * pairs + i] = static_cast<int16_t>(*values * factor);
@@ -79,8 +79,8 @@ void compare(const Rows& entries, int64_t begin, int64_t end, const int32_t* lan
     const int64_t count = std::min<int64_t>(end - begin, kTogether), width = 2 * entries.pairs;
     int32_t scores[kTogether][kLanes];
     {
-      Ints sums[kTogether];
-      for (int e = 0; e < kTogether; e++) sums[e] = all(static_cast<int32_t>(e < count ? -entries.squares[begin + e] : 0));
+      Ints sums[kTogether];  // in registers, because the bounds of loops over them are constant
+      for (int e = 0; e < kTogether; e++) sums[e] = all(static_cast<int32_t>(-entries.squares[begin + e]));
       const int16_t* row = entries.row(begin);
       for (int64_t p = 0; p < entries.pairs; p++) {
         const Ints x = load(lanes + p * kLanes);
@@ -151,8 +151,10 @@ struct Codebook {
         store(scores, best.scores[0]), store(places, best.entries[0]);
         for (int64_t l = 0; l < count; l++) score[which[l]] = scores[l], found[which[l]] = places[l];
       }
-    for (int64_t n = 0; n < points.count; n++)
-      squared[n] = found[n] < 0 ? std::numeric_limits<double>::infinity() : static_cast<double>(points.squares[n] - score[n]);
+    for (int64_t n = 0; n < points.count; n++) {
+      squared[n] = std::numeric_limits<double>::infinity();
+      if (found[n] >= 0) squared[n] = static_cast<double>(points.squares[n] - score[n]);
+    }
   }
 };
 
