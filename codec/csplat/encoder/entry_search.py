@@ -103,13 +103,13 @@ class EntrySearch:
 
         Args:
             entries: [K, D], K > 0.
-            near: number of groups searched; 0: one group of all entries.
+            near: number of groups searched; 0, or if there are no more than that: one group of all entries.
             reach: norm that no point exceeds. Points that are searched in parts need the same.
             context: threads.
         """
         shift = _shift(reach, entries)
         divided = _divide(entries, shift)
-        if not near:
+        if not 0 < near < math.isqrt(len(entries)):
             return cls(np.arange(len(entries)), divided, np.array([0, len(entries)]), None, 1, shift)
         centres, label = _groups(divided, context)
         order = np.argsort(label, kind="stable")
@@ -126,7 +126,7 @@ class EntrySearch:
         own = place if exclude_own else None
         divided = points if self.shift == 0 else _divide(points, self.shift)
         compiled = _compiled_search()
-        if compiled is None or (not _fits_int16(divided)):
+        if compiled is None or not _fits_int16(divided):
             squared = search_in_numpy(divided, self.entries, self.ends, self.centres, self.near, found, own, context)
         else:
             rows = np.ascontiguousarray(divided, np.int16)
@@ -163,10 +163,9 @@ def search_nearest(
     Returns:
         index [N] uint32; squared distances [N] float64 of the divided integers, in lattice units.
     """
-    near = near_groups if near_groups < math.isqrt(len(entries)) else 0
-    start = start if near else None
-    if start is not None:
-        near = min(near, NEXT_GROUPS)
+    if not 0 < near_groups < math.isqrt(len(entries)):
+        near_groups, start = 0, None
+    near = near_groups if start is None else min(near_groups, NEXT_GROUPS)
     search = EntrySearch.of(entries, near, largest_norm(points, context), context)
     return search.nearest(points, context, start=start, exclude_own=exclude_own)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from csplat.context import Context
 from csplat.encoder import entry_search
-from csplat.encoder.entry_search import search_nearest
+from csplat.encoder.entry_search import EntrySearch, largest_norm, search_nearest
 from csplat.encoder.kmeans import assign
 
 
@@ -22,9 +23,7 @@ def test_search_finds_the_first_nearest_entry():
     cases = [(many, rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)) for entry_count in sizes]
     wide = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
     cases.append((wide, wide[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)))
-    assert (
-        entry_search._shift(entry_search.largest_norm(cases[-1][0]), cases[-1][1]) == 0
-    )  # just below the bound of exact products
+    assert EntrySearch.of(cases[-1][1], 0, largest_norm(wide)).shift == 0  # just below the bound of exact products
     for points, entries in cases:
         expected, (index, error) = squared_distances(points, entries), search_nearest(points, entries)
         assert index.dtype == np.uint32
@@ -77,3 +76,11 @@ def test_the_thread_count_of_blas_is_restored():
     with entry_search.one_blas_thread():
         assert control[0]() == 1
     assert control[0]() == before
+
+
+def test_few_entries_are_one_group():
+    entries = np.arange(40, dtype=np.int32).reshape(20, 2)
+    assert EntrySearch.of(entries, 4, 60.0).centres is None
+    assert len(EntrySearch.of(entries, 3, 60.0).ends) == 5
+    points = np.full((3, 2), 7, np.int16)
+    assert [3, 3, 3] == EntrySearch.of(entries, 9, 60.0).nearest(points, Context(threads=1))[0].tolist()
