@@ -376,16 +376,14 @@ class _BandSums:
 
     def add(self, source: F32, decoded: F32 | np.float32, first: int) -> None:
         """Add values [n, k, 3] of the coefficients `first` to `first` + k - 1."""
-        difference = source - decoded
-        if not difference.size:
-            return
-        flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
-        span = slice(first, first + difference.shape[1])
-        for start in range(0, len(flat), _BLOCK):
-            squares = np.square(flat[start : start + _BLOCK], dtype=np.float64).sum(axis=0)
+        span, decoded = slice(first, first + source.shape[1]), np.broadcast_to(decoded, source.shape)
+        for start in range(0, len(source) if source.size else 0, _BLOCK):
+            difference = source[start : start + _BLOCK] - decoded[start : start + _BLOCK]
+            flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
+            squares = np.square(flat, dtype=np.float64).sum(axis=0)
             self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
-        np.abs(flat, out=flat)
-        np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
+            np.abs(flat, out=flat)
+            np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
 
     def by_band(self) -> dict[str, tuple[float, float]]:
         """Return (largest, sum of squares) by measure, enlarged by `_SLACK`."""
