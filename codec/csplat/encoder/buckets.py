@@ -87,8 +87,8 @@ class MemoryBuckets:
         with ThreadPoolExecutor(self.context.thread_count) as pool:
             sums = pool.map(lambda rows: contrast_sums(plain.select(rows)), contrast_buckets(self.rows))
             largest = pool.map(largest_sh, np.array_split(self.model.shN, len(self.rows)))
-            sample = self.model.select(sample_rows(len(self.model), self.bucket_splats))
-            return SceneSurvey(sample, max(largest), contrast_of(sums))
+            sample = pool.submit(self.model.select, sample_rows(len(self.model), self.bucket_splats))
+            return SceneSurvey(sample.result(), max(largest), contrast_of(sums))
 
 
 @dataclass(frozen=True, eq=False)
