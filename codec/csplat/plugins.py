@@ -6,6 +6,7 @@
 | `csplat.display` | `html`: a function that converts a `SplatModel` to HTML for notebooks |
 | `csplat.search` | `target`: a `csplat.encode_api.Search`, which meets a `Target` by rendering |
 | `csplat.levels` | `builder`: a function of splat count, options and levels that returns a `LevelBuilder` or `None` |
+| `csplat.kernels` | `nearest_entries`: a function that returns an `encoder.entry_search.NearestEntries` or `None` |
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def encode_file(
             local = stack.enter_context(source_path(source))
             reading: dict[str, Any] = {
                 "format": format, "strict": strict, "keep_extra": options.keep_extra, "sh_degree": read_degree(options),
-                "progress": context.progress,
+                "context": context,
             }  # fmt: skip
             if levels is None and (whole or _surely_fits(local, format, context)):
                 scene, builder = read_source(local, overrides, **reading), None

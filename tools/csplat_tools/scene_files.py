@@ -23,7 +23,7 @@ from csplat.scene import Scene, drop_bands, join_blocks
 from csplat.scene_metadata import LICENCE, Direction, SceneMetadata
 from csplat.splat_file import SplatFile
 from csplat.system import available_memory_bytes
-from csplat.types import Progress, null_progress
+from csplat.types import Progress
 from csplat_tools.file_streams import is_csplat, kept_path, local_path, naming, source_path
 
 #: Formats that are opened without unpacking, and are read as a whole in fewer passes.
@@ -114,7 +114,7 @@ def read_source(
     sh_degree: int | None = None,
     opened: Scene | None = None,
     in_memory: bool = True,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Scene:
     """Read a scene to be encoded, and repair defects if that is safe.
 
@@ -126,7 +126,7 @@ def read_source(
         keep_extra: keep additional columns.
         opened: the scene of the file, if it is open, with `sh_degree`.
         in_memory: read all splats into memory. Otherwise the result is `opened` with the overrides.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         CsplatError: the scene is not valid.
@@ -138,15 +138,16 @@ def read_source(
         findings = [*opened.findings, *dropped]
         refuse(findings, strict=strict)
         return overrides.apply_to_scene(opened).changed(findings=findings)
-    report = progress or null_progress
-    report("reading", 0.0)
+    context.progress("reading", 0.0)
     with source_path(file) as local:
         if opened is None or opened.format in CHEAP_TO_REOPEN:
-            scene = formats.read_scene(local, format, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree)
+            scene = formats.read_scene(
+                local, format, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, context=context
+            )
         else:
             scene = (opened if keep_extra else opened.without_extra()).loaded()
             refuse(scene.findings, strict=strict)
-    report("reading", 1.0)
+    context.progress("reading", 1.0)
     assert scene.in_memory is not None
     model = overrides.apply_to_model(scene.in_memory)
     return scene.changed(metadata=model.metadata, in_memory=model)

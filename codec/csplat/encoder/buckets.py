@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol, TypeVar
@@ -16,7 +17,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.coding_parameters import measure_contrast
+from csplat.context import Context
+from csplat.encoder.coding_parameters import contrast_of, contrast_sums
 from csplat.encoder.entropy import morton_codes
 from csplat.encoder.sh_codebook import largest_sh
 from csplat.model import SplatModel
@@ -39,7 +41,7 @@ class SceneSurvey:
     Attributes:
         sample: the splats `sample_rows` of the scene.
         largest_sh: largest magnitude of the SH coefficients of all splats.
-        contrast: contrast of the scene, see `measure_contrast`.
+        contrast: contrast of the scene, see `contrast_of`.
     """
 
     sample: SplatModel
@@ -72,18 +74,21 @@ class MemoryBuckets:
     model: SplatModel
     rows: Sequence[Rows]
     bucket_splats: int
+    context: Context
 
     @classmethod
-    def of(cls, model: SplatModel, bucket_splats: int) -> MemoryBuckets:
-        """Sort the splats of a scene into buckets."""
-        return cls(model, bucket_rows(model.means, bucket_splats), bucket_splats)
+    def of(cls, model: SplatModel, bucket_splats: int, context: Context) -> MemoryBuckets:
+        """Sort the splats of a scene into buckets, which are surveyed on threads."""
+        return cls(model, bucket_rows(model.means, bucket_splats), bucket_splats, context)
 
     def survey(self) -> SceneSurvey:
         """Survey the scene."""
         plain = replace(self.model, shN=self.model.shN[:, :0], extra={})  # SH has no influence, and takes most memory
-        contrast = measure_contrast(plain.select(rows) for rows in contrast_buckets(self.rows))
-        sample = self.model.select(sample_rows(len(self.model), self.bucket_splats))
-        return SceneSurvey(sample, largest_sh(self.model.shN), contrast)
+        with ThreadPoolExecutor(self.context.thread_count) as pool:
+            sums = pool.map(lambda rows: contrast_sums(plain.select(rows)), contrast_buckets(self.rows))
+            largest = pool.map(largest_sh, np.array_split(self.model.shN, len(self.rows)))
+            sample = pool.submit(self.model.select, sample_rows(len(self.model), self.bucket_splats))
+            return SceneSurvey(sample.result(), max(largest), contrast_of(sums))
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,7 +162,7 @@ def choose_parameters(
         model: the scene.
         options: the caller's options.
         importance_given: the caller specifies the importance of the splats.
-        contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
+        contrast: contrast of the scene that the model is a sample of; see `contrast_of`.
     """
     preset = PRESETS[options.preset]
     degree = options.kept_degree(model.sh_degree)
@@ -224,7 +224,7 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
 
     Args:
         model: the scene.
-        contrast: contrast of the scene, if the model is a sample, which has no neighbours; see `measure_contrast`.
+        contrast: contrast of the scene, if the model is a sample, which has no neighbours; see `contrast_of`.
     """
     if len(model) == 0:
         return SceneStatistics(reach=0.0, contrast=_CONTRAST_DEFAULT, size=0.01)
@@ -236,9 +236,14 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
 
 
-def measure_contrast(parts: Iterable[SplatModel]) -> float:
-    """Return the contrast of a scene from parts of it, each with all splats of its region."""
-    sums = [_contrast_sums(part, *_reach(part.means)) for part in parts if len(part)]
+def contrast_sums(part: SplatModel) -> tuple[float, float]:
+    """Return what `contrast_of` takes of a part of a scene that has all splats of its region."""
+    return _contrast_sums(part, *_reach(part.means)) if len(part) else (0.0, 0.0)
+
+
+def contrast_of(parts: Iterable[tuple[float, float]]) -> float:
+    """Return the contrast of a scene from the `contrast_sums` of parts of it, in their order."""
+    sums = list(parts)
     return _contrast(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
 
 

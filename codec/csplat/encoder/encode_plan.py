@@ -27,14 +27,7 @@ from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
-from csplat.encoder.sh_codebook import (
-    FileCodebooks,
-    ShCodebook,
-    ShCodingPlan,
-    assign_splats,
-    choose_sh_coding,
-    final_parameters,
-)
+from csplat.encoder.sh_codebook import FileCodebooks, choose_sh_coding, final_parameters
 from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantise_shapes
 from csplat.encoder.splat_importance import (
     Importance,
@@ -123,7 +116,7 @@ class EncodePlan:
             importance: [N] weights >= 0 of the splats, or an `Importance`; default: guessed from opacity and size.
             origin: the source of the scene; `None`: the scene itself.
             allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
-            contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
+            contrast: contrast of the scene that the model is a sample of; see `contrast_of`.
             context: see `EncodePlan`.
 
         Raises:
@@ -139,7 +132,7 @@ class EncodePlan:
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
-            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats), options, origin, context)
+            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats, context), options, origin, context)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
@@ -214,12 +207,15 @@ class EncodePlan:
         return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
     def choose_sh_coding(self) -> tuple[EncodePlan, FileCodebooks]:
-        """Choose the SH coding; return the complete plan and the codebooks with the assignment of the splats."""
+        """Choose the SH coding; return the complete plan and the codebooks with the assignment of the splats.
+
+        For a scene of several buckets, it is the assignment of the sample (`ShCodingPlan.of_sample`).
+        """
         model, parameters, importance = self.model, self.parameters, self.importance
         if self.sample is not None:
             sample, codebooks = self.sample.choose_sh_coding()
-            assigned = replace(codebooks, sh_plan=self._assign_all(sample.parameters, codebooks))
-            return replace(self, parameters=sample.parameters, sample=None), assigned
+            codebooks = replace(codebooks, sh_plan=replace(codebooks.sh_plan, of_sample=True))
+            return replace(self, parameters=sample.parameters, sample=None), codebooks
         uses_weights = parameters.adaptive > 0.0 or parameters.sh_coding in ("auto", "codebook")
         weights = splat_weights(model, importance) if importance is not None or uses_weights else None
         parameters, codebooks = choose_sh_coding(
@@ -234,30 +230,6 @@ class EncodePlan:
             context=self.context,
         )
         return replace(self, parameters=parameters), codebooks
-
-    def _assign_all(self, parameters: CodingParameters, codebooks: FileCodebooks) -> ShCodingPlan:
-        """Assign all splats to the codebooks of the sample, bucket by bucket.
-
-        Args:
-            parameters: the final parameters.
-            codebooks: codebooks of the sample, whose plan has the assignment of the sample.
-
-        Returns:
-            The plan with weights and assignment of all splats; the same plan if it has neither.
-        """
-        sh_plan, count = codebooks.sh_plan, len(self.model)
-        if sh_plan.book is None and sh_plan.weights is None:
-            return sh_plan
-        index = None if sh_plan.book is None else np.empty(count, np.int32)
-        weights = None if sh_plan.weights is None else np.empty(count, np.float32)
-        for rows in self.buckets:
-            part = assign_splats(codebooks, self.model.select(rows), parameters, self.context)
-            if weights is not None and part.weights is not None:
-                weights[rows] = part.weights
-            if index is not None and part.book is not None:
-                index[rows] = part.book.index
-        book = None if sh_plan.book is None or index is None else ShCodebook(sh_plan.book.entries, index)
-        return replace(sh_plan, weights=weights, book=book)
 
 
 def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: QuantisationClasses | None) -> NDArray[np.intp]:

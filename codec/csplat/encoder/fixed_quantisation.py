@@ -28,7 +28,14 @@ from csplat.encoder.quantisation import (
     quat_levels,
     quat_values,
 )
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodebook, ShCodingPlan, make_codebooks, sh_coarseness
+from csplat.encoder.sh_codebook import (
+    FileCodebooks,
+    ShCodebook,
+    ShCodingPlan,
+    assign_splats,
+    make_codebooks,
+    sh_coarseness,
+)
 from csplat.encoder.shape_codebook import ShapeCodebook, dequantise_shapes
 from csplat.encoder.tiling import dequantise_means, dequantise_opacities, quantise_and_sort
 from csplat.errors import InputError
@@ -280,11 +287,14 @@ def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> Fixe
     if len(source) != source_count:
         raise InputError(f"the source has {len(source)} splats, expected {source_count} by the origin")
     plan, codebooks = plan.choose_sh_coding()
+    sh_plan = codebooks.sh_plan
+    if sh_plan.of_sample:
+        sh_plan = assign_splats(sh_plan, plan.model, plan.parameters, plan.context)
     parameters = replace(plan.parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
     plan = replace(_reorder(plan, order, [len(part) for part in rows]), parameters=parameters)
-    sh_plan, means = codebooks.sh_plan.select(order), plan.model.means
+    sh_plan, means = sh_plan.select(order), plan.model.means
     low, high = np.empty_like(means), np.empty_like(means)
     for tile in plan.tiles:
         low[tile.rows], high[tile.rows] = means[tile.rows].min(axis=0), means[tile.rows].max(axis=0)

@@ -1,8 +1,7 @@
 """Cluster lattice integers by weighted k-means, with the same result for any number of threads.
 
-Assignments are matrix products in float32 of integers and halves. Their partial sums stay below 2**23 and are exact, so
-the result depends neither on the order of additions in a BLAS nor on its threads. Centroids are float64 sums in the
-order of the points, rounded to integers. All random numbers come from one seeded generator.
+Assignments are exact (`entry_search.py`). Centroids are float64 sums in the order of the points, rounded to integers.
+All random numbers come from one seeded generator.
 
 `refine_by_metric` continues the iteration if every point x has its own error metric w Σ_channels (x - c)ᵀ M (x - c).
 The candidates of a point are the neighbours of its entry; centroids solve the normal equations of their points.
@@ -10,42 +9,25 @@ The candidates of a point are the neighbours of its entry; centroids solve the n
 
 from __future__ import annotations
 
-import ctypes
-import math
-import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from functools import cache
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.encoder.entry_search import NEXT_GROUPS, one_blas_thread, search_nearest
 from csplat.encoder.splat_importance import ErrorMetric, doubled_triangles, matrix_products
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
-# Searches entries for a block of n points: (rows [x, 1] of the points, [n, D + 1]; index of the first point; index of
-# the best entry so far, [n]; its score, [n]). Updates the last two in place.
-_Search = Callable[[F32, int, I64, F32], None]
 Floats = NDArray[Any]
 
 _SEED_ROUNDS = (8, 2)  # rounds in which the initial entries are drawn, for few points and for many
 _FEW_POINTS = 1 << 14  # for more, 8 rounds lower the error by 0.3 %; for a few hundred extreme points, by up to 40 %
-_EXACT = 2.0**23  # float32 represents every multiple of 1/2 below this
-_PRODUCT = 1 << 18  # scores per matrix product, 1 MiB, which fits the second-level cache
-_PRODUCT_COLUMNS = 1024  # entries per matrix product
-_BLOCK = 1 << 13  # points that a thread assigns, and sorts by group, at a time
-_GROUP_ITERATIONS = 2
 _REFINED_POINTS = 1 << 16  # minimum number of points of the last iteration, unless there are fewer
 _REFINED_PER_ENTRY = 64  # the same, per entry
-_NEXT_GROUPS = 2  # groups searched if a near entry is known; 4 take a fifth longer for 0.2 to 0.6 % less RMS error
-_BLAS = threading.RLock()  # a BLAS has one thread count per process: one search at a time
 _CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of this entry
 _REFINE_ROUNDS = 2  # iterations under the metric
 _METRIC_BLOCK = 1 << 12  # points per block of temporaries
@@ -74,7 +56,7 @@ def cluster(
         size: maximum number of entries, > 0.
         iterations: k-means iterations on the sample.
         sample_per_entry: points of the sample per entry, > 0.
-        near_groups: see `assign`; once a point has an entry, `_NEXT_GROUPS` groups are searched for a nearer entry.
+        near_groups: see `assign`; once a point has an entry, `NEXT_GROUPS` groups are searched for a nearer entry.
         context: threads, progress, and the seed of the sample and of the initial entries.
 
     Returns:
@@ -102,7 +84,7 @@ def cluster(
             sample, index = points[rows], None
         index, error = search_nearest(sample, entries, near_groups, context, start=index)
         entries = _move_to_means(sample, sample_w, index, entries)
-        _relocate(entries, index, sample, sample_w, error, moves_max, min(near_groups, _NEXT_GROUPS), rng, context)
+        _relocate(entries, index, sample, sample_w, error, moves_max, min(near_groups, NEXT_GROUPS), rng, context)
         context.progress("codebook", (step + 1) / (iterations + 2))
     is_sample = len(sample) < len(points)
     index = search_nearest(points, entries, near_groups, context, start=None if is_sample else index)[0]
@@ -143,102 +125,6 @@ def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
     rank = np.empty(len(entries), np.uint32)
     rank[order] = np.arange(len(entries), dtype=np.uint32)
     return rank[index], entries[order]
-
-
-def search_nearest(
-    points: I16 | I32,
-    entries: I32,
-    near_groups: int = 0,
-    context: Context = DEFAULT_CONTEXT,
-    *,
-    start: U32 | None = None,
-    exclude_own: bool = False,
-) -> tuple[U32, F64]:
-    """Assign each point to the nearest entry, and return the squared distances.
-
-    As |x - c|² = |x|² - 2 (x·c - |c|²/2), the nearest entry has the highest score x·c - |c|²/2, which is the product of
-    [x, 1] and [c, -|c|²/2].
-
-    Args:
-        points: [N, D], lattice integers. If max|x| max|c| + max|c|²/2 reaches 2**23 (norms of about 2,300), points and
-            entries are first divided by a power of two and rounded.
-        entries: [K, D], K > 0.
-        near_groups: see `assign`.
-        context: threads.
-        start: [N], an entry near each point. The result is as near, and at most `_NEXT_GROUPS` groups are searched.
-        exclude_own: exclude entry n for point n: the points are the entries.
-
-    Returns:
-        index [N] uint32; squared distances [N] float64 of the divided integers, in lattice units.
-    """
-    shift = _shift(points, entries)
-    coarse = _divide(entries, shift)
-    index = np.zeros(len(points), np.uint32)
-    error = np.zeros(len(points))
-    table = _table(coarse)
-    if 0 < near_groups < math.isqrt(len(entries)):
-        near = near_groups if start is None else min(near_groups, _NEXT_GROUPS)
-        search = _near_entries(coarse, table, near, context, exclude_own)
-    else:
-        start = None
-        search = _every_entry(table, exclude_own)
-
-    def work(part: slice) -> None:
-        rows = np.ones((part.stop - part.start, table.shape[1]), np.float32)
-        rows[:, :-1] = points[part] if shift == 0 else _divide(points[part], shift)
-        nearest = np.zeros(len(rows), np.int64)
-        best = np.full(len(rows), -np.inf, np.float32)
-        if start is not None:
-            nearest[:] = start[part]
-            best[:] = np.einsum("nd,nd->n", rows, np.take(table, nearest, axis=0))
-        search(rows, part.start, nearest, best)
-        index[part] = nearest
-        norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
-        error[part] = (norm - 2.0 * best) * 4.0**shift
-
-    with one_blas_thread():
-        run_blocks(work, len(points), _BLOCK, context)
-    return index, error
-
-
-def run_blocks(work: Callable[[slice], object], count: int, length: int, context: Context) -> None:
-    """Call `work` with the slices of `length` of `count` rows, in threads unless there is one slice.
-
-    Args:
-        work: writes results to these rows; releases the GIL for most of its time.
-        count: number of rows.
-        length: rows per slice.
-        context: threads.
-    """
-    slices = [slice(start, min(start + length, count)) for start in range(0, count, length)]
-    workers = min(context.thread_count, len(slices))
-    if workers <= 1:  # a small scene takes less time than starting a thread
-        for part in slices:
-            work(part)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(work, slices))
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Run matrix products on one thread, if NumPy's BLAS is an OpenBLAS whose thread count can be set.
-
-    Our own threads already use all processors. OpenBLAS's threads wait by spinning: next to another busy program, these
-    products took 20 times as long.
-    """
-    control = _openblas()
-    if control is None:
-        yield
-        return
-    get_thread_count, set_thread_count = control
-    with _BLAS:
-        previous = get_thread_count()
-        set_thread_count(1)
-        try:
-            yield
-        finally:
-            set_thread_count(previous)
 
 
 @one_blas_thread()
@@ -450,170 +336,6 @@ def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
     """Return the entries [K, D] that some point uses, in their order, and the points' index [N] among them."""
     used = np.bincount(index, minlength=len(entries)) > 0
     return entries[used], (np.cumsum(used) - 1).astype(np.uint32)[index]
-
-
-def _shift(points: I16 | I32, entries: I32) -> int:
-    """Return the smallest shift after which all scores of points [N, D] and entries [K, D] are exact."""
-    x, c = _largest_norm(points), _largest_norm(entries)
-    slack = math.sqrt(points.shape[1])  # rounding moves a vector by at most half of this
-    shift = 0
-    while (x + slack) * (c + slack) + (c + slack) ** 2 / 2 >= _EXACT:
-        x, c, shift = x / 2, c / 2, shift + 1
-    return shift
-
-
-def _largest_norm(rows: I16 | I32) -> float:
-    """Return the largest Euclidean norm of rows [N, D]."""
-    largest = 0.0
-    for a in range(0, len(rows), _BLOCK):
-        part = rows[a : a + _BLOCK].astype(np.float64)
-        largest = max(largest, float(np.einsum("nd,nd->n", part, part).max()))
-    return math.sqrt(largest)
-
-
-def _divide(rows: I16 | I32, shift: int) -> I64:
-    """Return integers divided by 2**shift, rounded to the nearest, halves up."""
-    return (rows.astype(np.int64) + ((1 << shift) >> 1)) >> shift
-
-
-def _table(entries: I64) -> F32:
-    """Return the rows [c, -|c|²/2] of the entries, [K, D + 1]."""
-    half = np.einsum("kd,kd->k", entries, entries) * -0.5
-    return np.concatenate([entries, half[:, None]], axis=1).astype(np.float32)
-
-
-def _every_entry(table: F32, exclude_own: bool) -> _Search:
-    """Return a search of every entry in a `_table`, [K, D + 1]; `exclude_own` skips entry i for point i."""
-    matrix = np.ascontiguousarray(table.T)
-    width = min(matrix.shape[1], _PRODUCT_COLUMNS)
-    step = _PRODUCT // width
-
-    def search(x: F32, start: int, index: I64, best: F32) -> None:
-        for first_row in range(0, len(x), step):
-            part = slice(first_row, first_row + step)
-            rows = np.arange(len(x[part]))
-            for first_entry in range(0, matrix.shape[1], width):
-                scores = x[part] @ matrix[:, first_entry : first_entry + width]
-                if exclude_own:
-                    own = rows + (start + first_row - first_entry)  # columns of the points' own entries
-                    inside = (own >= 0) & (own < scores.shape[1])
-                    scores[rows[inside], own[inside]] = -np.inf
-                _keep_better(rows, scores, first_entry, index[part], best[part])
-
-    return search
-
-
-def _near_entries(entries: I64, table: F32, near: int, context: Context, exclude_own: bool) -> _Search:
-    """Return a search of the entries in the `near` groups whose centroids are nearest to a point.
-
-    A point whose groups have no entry, or only its own that is excluded, keeps index and score.
-
-    Args:
-        entries: [K, D], which are grouped here.
-        table: [K, D + 1], the `_table` of the entries.
-        near: number of groups per point, > 0.
-        context: threads.
-        exclude_own: skip entry i for point i.
-    """
-    centres, label = _groups(entries, context)
-    order = np.argsort(label, kind="stable")
-    ends = np.searchsorted(label[order], np.arange(len(centres) + 1))
-    matrices = [np.ascontiguousarray(table[order[a:b]].T) for a, b in pairwise(ends)]
-    coarse = np.ascontiguousarray(_table(centres).T)
-    place = np.empty_like(order)  # the inverse of `order`
-    place[order] = np.arange(len(order))
-
-    def search(x: F32, start: int, index: I64, best: F32) -> None:
-        nearest = np.empty_like(index)  # positions in `order`
-        previous_best = best.copy()
-        for group_rows, group in _by_group(x @ coarse, near):
-            width = matrices[group].shape[1]
-            for rows in np.array_split(group_rows, -(-len(group_rows) * width // _PRODUCT)) if width else ():
-                scores = np.take(x, rows, axis=0) @ matrices[group]  # unlike x[rows], `take` releases the GIL
-                if exclude_own:
-                    own = place[rows + start] - ends[group]  # columns of the points' own entries
-                    inside = np.flatnonzero((own >= 0) & (own < width))
-                    scores[inside, own[inside]] = -np.inf
-                _keep_better(rows, scores, int(ends[group]), nearest, best)
-        better = best > previous_best
-        index[better] = order[nearest[better]]
-
-    return search
-
-
-def _by_group(scores: F32, near: int) -> Iterator[tuple[I64, int]]:
-    """Yield the rows of which a group is among the `near` with the highest scores [n, groups], and the group.
-
-    Groups ascend; a group without rows is omitted. The highest scores are overwritten.
-    """
-    count, groups = scores.shape
-    rows = np.arange(count)
-    chosen = np.empty((near, count), np.uint16)  # NumPy sorts 16 bits by radix
-    for number in range(near):
-        chosen[number] = first = scores.argmax(1)
-        scores[rows, first] = -np.inf
-    flat = chosen.reshape(-1)
-    order = np.argsort(flat, kind="stable")
-    ends = np.searchsorted(flat[order], np.arange(groups + 1))
-    order %= count  # from indices in `flat` to rows
-    for group in range(groups):
-        if ends[group] < ends[group + 1]:
-            yield order[ends[group] : ends[group + 1]], group
-
-
-def _keep_better(rows: I64, scores: F32, first: int, index: I64, best: F32) -> None:
-    """Update `index` and `best` in place for the `rows` [n] that one of k further entries has a higher score for.
-
-    Args:
-        rows: [n], distinct rows of `index` and `best`.
-        scores: [n, k], k > 0, of the entries `first` to `first` + k - 1; of equal ones the first counts.
-        first: the entry of the first column.
-        index, best: entry and score of every point so far; equal scores keep the entry.
-    """
-    column = scores.argmax(1)
-    score = scores[np.arange(len(column)), column]
-    better = np.flatnonzero(score > best[rows])
-    rows = rows[better]
-    index[rows] = column[better] + first
-    best[rows] = score[better]
-
-
-def _groups(entries: I64, context: Context) -> tuple[I64, U32]:
-    """Cluster entries [K, D] into G = floor(sqrt(K)) groups by plain k-means; a group may be empty.
-
-    Returns:
-        The centroids, [G, D], rounded; the group of each entry, [K].
-    """
-    count = math.isqrt(len(entries))
-    rows = entries.astype(np.int32)
-    centres = rows[np.arange(count) * len(rows) // count]
-    label, _ = search_nearest(rows, centres, 0, context)
-    for _ in range(_GROUP_ITERATIONS - 1):
-        size = np.bincount(label, minlength=count)
-        sums = [np.bincount(label, column, count) for column in rows.T]
-        used = size > 0
-        centres[used] = np.rint(np.stack(sums, 1)[used] / size[used, None])
-        label, _ = search_nearest(rows, centres, 0, context)
-    return centres.astype(np.int64), label
-
-
-@cache
-def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
-    """Return the functions of NumPy's OpenBLAS that get and set its number of threads; `None` if unavailable."""
-    core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
-    bundled = Path(np.__file__).parent.parent / "numpy.libs"
-    paths = [str(getattr(core, "__file__", "")), *map(str, sorted(bundled.glob("*openblas*")))]
-    for path in filter(None, paths):
-        try:
-            library = ctypes.CDLL(path)
-        except OSError:
-            continue
-        for name in ("scipy_openblas_{}64_", "openblas_{}64_", "scipy_openblas_{}", "openblas_{}"):
-            get = getattr(library, name.format("get_num_threads"), None)
-            put = getattr(library, name.format("set_num_threads"), None)
-            if get and put:
-                return get, put
-    return None
 
 
 def _neighbours(entries: Floats, candidates: int) -> I64:

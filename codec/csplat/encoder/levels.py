@@ -14,7 +14,7 @@ from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
 from csplat.encoder.container import FileNode, FileTile, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
 from csplat.encoder.pipeline import EncodedTiles, encode_tile, encode_tiles
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats, nearest_entries
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, nearest_entries
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
@@ -167,6 +167,6 @@ def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebook
     """
     sh_plan = codebooks.sh_plan
     if sh_plan.book is None:
-        return replace(assign_splats(codebooks, splats, plan.parameters, plan.context), extras=())
+        return replace(sh_plan, of_sample=True, extras=())  # for the weights
     book = nearest_entries(sh_plan.book, splats, plan.parameters, plan.context)
-    return replace(sh_plan, weights=None, book=book, extras=())
+    return replace(sh_plan, weights=None, book=book, extras=(), of_sample=False)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import Context
 from csplat.disk_files import atomic_writer
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, StepFactors
@@ -41,7 +42,7 @@ from csplat.encoder.error_bounds import (
     value_errors,
 )
 from csplat.encoder.quantisation import check_finite, lattice_values, opacity_levels, opacity_values, quantise_colour
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, encode_sh
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats, encode_sh
 from csplat.encoder.shape_codebook import (
     SHAPE_CODEBOOK_ID,
     ShapeCodebook,
@@ -59,6 +60,7 @@ from csplat.types import F32, Progress, null_progress
 
 Integers = NDArray[Any]
 
+_ALONE = Context(threads=1)  # tiles are shared among threads
 _FEW_TILES, _SMALL_TILE = 16, 256  # more tiles than this, with fewer splats per tile on average, cause a note
 _COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH4 + 1))
 _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
@@ -329,15 +331,17 @@ def encode_tile(
     result = _TileResult(parameters, tile.factors)
     quantised = quantise_and_sort(model, tile, parameters)
     rows = quantised.rows
+    splats = model.select(rows)
+    sh_plan = assign_splats(sh_plan, splats, parameters, _ALONE) if sh_plan.of_sample else sh_plan.select(rows)
     part = None if shapes is None else shapes.part(rows)
-    result.add_opacities(np.take(model.opacities, rows))
-    max_scale = result.add_shapes(np.take(model.quats, rows, axis=0), np.take(model.scales, rows, axis=0), part)
+    result.add_opacities(splats.opacities)
+    max_scale = result.add_shapes(splats.quats, splats.scales, part)
     result.add_means(take_precise_means(model, rows), quantised, math.ldexp(parameters.lattice.step, tile.exponent))
-    result.add_sh0(np.take(model.sh0, rows, axis=0))
+    result.add_sh0(splats.sh0)
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: result.blocks}
     used: tuple[int, ...] = () if part is None else (SHAPE_CODEBOOK_ID,)
     if model.sh_degree:
-        blocks, exponent, errors = encode_sh(model.shN, rows, parameters, sh_plan)
+        blocks, exponent, errors = encode_sh(splats.shN, parameters, sh_plan)
         layers |= {layer: [block] for layer, block in blocks.items()}
         used = (*sh_plan.codebook_ids, *used)
         if exponent:
@@ -346,7 +350,7 @@ def encode_tile(
             result.add_errors(measure, pair)
     if sh_plan.extras:
         layers[_spec.LAYER_EXTRA] = [
-            entropy.raw_block(column, np.take(model.extra[name], rows), parameters.deflate)
+            entropy.raw_block(column, splats.extra[name], parameters.deflate)
             for column, name in enumerate(sh_plan.extras)
         ]
     corner, extent = quantised.corner, quantised.q.max(axis=1)

@@ -1,7 +1,7 @@
 """Encode SH bands 1 to 4 with scalar coding or a codebook with escapes, whichever is smaller at equal distortion.
 
 (Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene. For a scene with more splats than a bucket it is
-trained on a sample, and an `AssignmentRule` assigns the other splats.
+trained on a sample, and an `AssignmentRule` assigns the splats of each tile.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from csplat.encoder.coding_parameters import CodingParameters, band_slice
 from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import signed_stream, trial_settings
-from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric, run_blocks
+from csplat.encoder.entry_search import EntrySearch, run_blocks
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
 from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_values, lift_colour, quantise_sh
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
@@ -81,6 +82,21 @@ class ShCodebook:
         return np.take(lattice_values(rgb, parameters.sh_step), self.index, axis=0, mode="clip")
 
 
+@dataclass(frozen=True, eq=False)
+class AssignmentRule:
+    """A trained codebook with the rule that assigns splats outside the training set.
+
+    Attributes:
+        entries: [size, 3K] int32, R, G, B of each coefficient.
+        search: the entries, prepared for searches.
+        threshold: weighted squared error from which a splat is escaped.
+    """
+
+    entries: I32
+    search: EntrySearch
+    threshold: float
+
+
 @dataclass(frozen=True)
 class ShCodingPlan:
     """The SH coding of a file, as its tiles need it.
@@ -90,12 +106,16 @@ class ShCodingPlan:
         reference: weight above which a splat is quantised on the full lattice.
         book: the codebook; `None` without a codebook.
         extras: names of the extra columns to write.
+        rule: assigns splats outside the training set of the codebook; `None` without a codebook.
+        of_sample: weights and assignment are those of a sample of the scene; each tile gets its own.
     """
 
     weights: F32 | None = None
     reference: float = 1.0
     book: ShCodebook | None = None
     extras: Sequence[str] = ()
+    rule: AssignmentRule | None = None
+    of_sample: bool = False
 
     @property
     def codebook_ids(self) -> tuple[int, ...]:
@@ -108,29 +128,13 @@ class ShCodingPlan:
         return replace(self, weights=weights, book=None if self.book is None else self.book.select(order))
 
 
-@dataclass(frozen=True, eq=False)
-class AssignmentRule:
-    """A trained codebook with the rule that assigns splats outside the training set.
-
-    Attributes:
-        entries: [size, 3K] int32, R, G, B of each coefficient.
-        near_groups: see `assign`.
-        threshold: weighted squared error from which a splat is escaped.
-    """
-
-    entries: I32
-    near_groups: int
-    threshold: float
-
-
 @dataclass(frozen=True)
 class FileCodebooks:
-    """SH plan, codebooks with index records and chunks, and the rule for splats outside the training set."""
+    """SH plan, and codebooks with index records and chunks."""
 
     sh_plan: ShCodingPlan
     records: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = ()
-    rule: AssignmentRule | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +207,7 @@ def choose_sh_coding(
     )
     rgb = rule.entries.reshape(len(rule.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
     book = ShCodebook(colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift), index)
-    codebooks = replace(make_codebooks(sh_plan, book, fine), rule=rule)
+    codebooks = make_codebooks(replace(sh_plan, rule=rule), book, fine)
     rate = _codebook_rate(codebooks, book)
     if is_open and not _codebook_pays(model, error_weights, book, rate, distortion, trial[:_TRIAL_SPLATS], parameters):
         return scalar
@@ -224,26 +228,27 @@ def largest_sh(shN: F32) -> float:
 
 
 def assign_splats(
-    codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, context: Context
+    sh_plan: ShCodingPlan, model: SplatModel, parameters: CodingParameters, context: Context
 ) -> ShCodingPlan:
-    """Assign splats outside the training set.
+    """Return the plan of splats outside the training set, with their own weights and assignment.
 
     Args:
-        codebooks: trained on a sample of the scene.
-        model: a bucket of the scene; the result may depend on which splats are assigned together.
+        sh_plan: the plan of a sample of the scene.
+        model: splats of the scene.
         parameters: the final parameters.
         context: threads.
     """
-    sh_plan, rule = codebooks.sh_plan, codebooks.rule
     weights = None if sh_plan.weights is None else splat_weights(model, None)
+    own = replace(sh_plan, weights=weights, of_sample=False)
+    rule = sh_plan.rule
     if rule is None or sh_plan.book is None or weights is None:
-        return replace(sh_plan, weights=weights)
-    points = _lattice_points(model.shN, parameters, context)
-    index = assign(points, rule.entries, near_groups=rule.near_groups, context=context).astype(np.int32)
+        return own
+    nearest, _ = rule.search.nearest(_lattice_points(model.shN, parameters, context), context)
+    index = nearest.astype(np.int32)
     error_weights = _ErrorWeights(weights, None, measured=False)
     errors = _entry_errors(model.shN, index, rule.entries, parameters, error_weights, context)
     index[errors >= rule.threshold] = sh_plan.book.size
-    return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
+    return replace(own, book=ShCodebook(sh_plan.book.entries, index))
 
 
 def nearest_entries(book: ShCodebook, model: SplatModel, parameters: CodingParameters, context: Context) -> ShCodebook:
@@ -275,7 +280,7 @@ def make_codebooks(sh_plan: ShCodingPlan, book: ShCodebook, parameters: CodingPa
     return FileCodebooks(replace(sh_plan, book=book), (record,), tuple(chunks))
 
 
-def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan) -> I32 | None:
+def sh_coarseness(rows: Rows | slice, parameters: CodingParameters, sh_plan: ShCodingPlan) -> I32 | None:
     """Return the exponent e of the multiples 2**e of the SH step that each splat is rounded to, [n]; `None` for 0.
 
     With adaptivity a and reference weight w₀, e = a/2 · log₂(w₀ / w): for a = 1, w · (2**e)² is constant.
@@ -288,30 +293,28 @@ def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPla
 
 
 def encode_sh(
-    shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan
+    source: F32, parameters: CodingParameters, sh_plan: ShCodingPlan
 ) -> tuple[dict[int, bytes], int, dict[str, tuple[float, float]]]:
     """Encode the bands 1 to `parameters.sh_degree` of a tile.
 
     Args:
-        shN: [N, K, 3], all splats of the model, whose degree may be higher.
-        rows: [n], the tile's splats in decoding order.
+        source: [n, K, 3], the tile's splats in decoding order; their degree may be higher.
         parameters: steps and codings.
-        sh_plan: SH coding of the file.
+        sh_plan: SH coding of these splats.
 
     Returns:
         The block of each layer, none for a band of zeros; the exponent of the tile's lattice; largest error and sum of
         squares by measure.
     """
-    source = np.take(shN, rows, axis=0)
     kept = parameters.sh_coefficients
     sums = _BandSums(source.shape[1])
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
     exponent = 0
     if sh_plan.book is not None:
-        layers = _encode_by_codebook(source[:, :kept], sh_plan.book.select(rows), parameters, sums)
+        layers = _encode_by_codebook(source[:, :kept], sh_plan.book, parameters, sums)
     elif kept:
-        coarse = sh_coarseness(rows, parameters, sh_plan)
+        coarse = sh_coarseness(slice(None), parameters, sh_plan)
         columns, exponent, decoded = quantise_sh(source[:, :kept], parameters, coarse)
         sums.add(source[:, :kept], decoded, 0)
         layers = dict(_scalar_blocks(columns, exponent, parameters))
@@ -373,16 +376,14 @@ class _BandSums:
 
     def add(self, source: F32, decoded: F32 | np.float32, first: int) -> None:
         """Add values [n, k, 3] of the coefficients `first` to `first` + k - 1."""
-        difference = source - decoded
-        if not difference.size:
-            return
-        flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
-        span = slice(first, first + difference.shape[1])
-        for start in range(0, len(flat), _BLOCK):
-            squares = np.square(flat[start : start + _BLOCK], dtype=np.float64).sum(axis=0)
+        span, decoded = slice(first, first + source.shape[1]), np.broadcast_to(decoded, source.shape)
+        for start in range(0, len(source) if source.size else 0, _BLOCK):
+            difference = source[start : start + _BLOCK] - decoded[start : start + _BLOCK]
+            flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
+            squares = np.square(flat, dtype=np.float64).sum(axis=0)
             self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
-        np.abs(flat, out=flat)
-        np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
+            np.abs(flat, out=flat)
+            np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
 
     def by_band(self) -> dict[str, tuple[float, float]]:
         """Return (largest, sum of squares) by measure, enlarged by `_SLACK`."""
@@ -448,7 +449,8 @@ def _train(
     errors[escaped] = 0.0
     index[escaped] = len(entries)
     total = float(weights.sum(dtype=np.float64)) or 1.0
-    rule = AssignmentRule(entries, effort.get("near_groups", 0), threshold)
+    search = EntrySearch.of(entries, effort.get("near_groups", 0), _CLIP * points.shape[1] ** 0.5, context)
+    rule = AssignmentRule(entries, search, threshold)
     return rule, index, float(errors.sum()) / total
 
 

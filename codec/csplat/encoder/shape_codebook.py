@@ -22,8 +22,9 @@ from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, StepF
 from csplat.encoder.container import CODEBOOK_ID_SIZE, FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, signed_stream
+from csplat.encoder.entry_search import search_nearest
 from csplat.encoder.error_bounds import covariance_entries
-from csplat.encoder.kmeans import cluster, rank_by_frequency, reassign_by_metric, search_nearest
+from csplat.encoder.kmeans import cluster, rank_by_frequency, reassign_by_metric
 from csplat.encoder.quantisation import canonicalise_shape, lattice_exponent, lattice_values, quat_levels, quat_values
 from csplat.encoder.splat_importance import ErrorMetric
 from csplat.encoder.tiling import TileSplats, quantise_and_sort

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from csplat._spec import MAGIC
 from csplat.byte_store import Store
-from csplat.context import Context
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import Limits, decode
 from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.disk_files import local_file, size_on_disk, temporary_folder, work_folder
@@ -98,18 +98,22 @@ def read_scene(
     strict: bool = False,
     keep_extra: bool = False,
     sh_degree: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Scene:
-    """Read a scene into memory as `read` does, with its findings, format, name and size."""
+    """Read a scene into memory as `read` does, on threads, with its findings, format, name and size."""
     if is_url(file):
         with open(file, format, sh_degree=sh_degree) as opened:
             return _load_scene(opened, strict=strict, keep_extra=keep_extra)
     with local_file(file) as path:
         file_format, findings = detect_format(path, format), list[Finding]()
         if file_format.name == _PLY:
-            model = read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
+            model = read_ply(
+                path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings, context=context
+            )
         elif file_format.name == _CSPLAT:
             check_sh_degree(sh_degree)
-            model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, file_format.degree))
+            degree = None if sh_degree is None else min(sh_degree, file_format.degree)
+            model = decode(path, sh_degree=degree, context=context)
         else:
             with open(path, format, sh_degree=sh_degree) as opened:
                 return _load_scene(opened, strict=strict, keep_extra=keep_extra)

@@ -25,7 +25,7 @@ from csplat.encoder.encode_plan import EncodePlan, Origin, clip_scales
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.encoder.levels import LevelBuilder, encode_levels
 from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tiles
-from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
+from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import missing_package
 from csplat.file_source import open_binary
@@ -43,7 +43,7 @@ class BucketCoding:
     Attributes:
         folder: the working folder.
         plan: the complete plan, without splats.
-        codebooks: codebooks trained on the sample, without the assignment of its splats.
+        codebooks: codebooks trained on the sample.
         levels: builds levels of detail; `None`: there are none.
     """
 
@@ -154,14 +154,12 @@ def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     model = clip_scales(read_bucket(coding.folder, coding.plan.model, bucket))
     context = coding.plan.context
     plan = replace(coding.plan, model=model, origin=Origin(len(model), np.arange(len(model))))
-    sh_plan = assign_splats(coding.codebooks, model, plan.parameters, context)
-    codebooks = replace(coding.codebooks, sh_plan=sh_plan)
     if coding.levels is None:
-        return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), codebooks)
+        return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), coding.codebooks)
     nodes = coding.levels.build_part(model, coding.plan.origin.source_count, context)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
-    return coding.levels.measure(encode_levels(plan, nodes, codebooks), context)
+    return coding.levels.measure(encode_levels(plan, nodes, coding.codebooks), context)
 
 
 def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[FileNode]]:

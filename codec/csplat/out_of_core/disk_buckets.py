@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from csplat.disk_files import atomic_writer, check_free_space
 from csplat.encoder.buckets import BucketCurve, SceneSurvey, bucket_slices, contrast_buckets, sample_rows
-from csplat.encoder.coding_parameters import measure_contrast
+from csplat.encoder.coding_parameters import contrast_of, contrast_sums
 from csplat.encoder.sh_codebook import largest_sh
 from csplat.errors import InputError
 from csplat.file_source import open_binary, read_bytes
@@ -259,7 +259,8 @@ def _sort(scene: Scene, folder: Path, bucket_splats: int, progress: Progress) ->
     counts = _spill(scene.with_progress("sorting", progress), folder, curve)
     store = DiskBuckets(folder, scene.empty(), bucket_splats, counts, largest, 0.0)
     chosen = contrast_buckets(store.buckets)
-    return replace(store, contrast=measure_contrast(read_bucket(folder, store.model, bucket) for bucket in chosen))
+    parts = (contrast_sums(read_bucket(folder, store.model, bucket)) for bucket in chosen)
+    return replace(store, contrast=contrast_of(parts))
 
 
 def _survey(scene: Scene, folder: Path, bucket_splats: int) -> tuple[BucketCurve, float]:

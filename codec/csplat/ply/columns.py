@@ -7,13 +7,16 @@ memory takes 0.1 s for a million splats of SH degree 3, a tenth of the time of a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import counted
 from csplat.lint import Finding
 from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats, squared_lengths
@@ -40,6 +43,7 @@ HUGE_LOG = 88.0
 #: Natural logarithm of 100: the third scale of a disc is a hundredth of the smallest scale in the file.
 _FLAT_SCALE_STEP = 4.605170
 
+_MANY_BYTES = 1 << 24  # bytes of rows from which threads are worth starting
 _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions, which drift during training
 _LARGEST_COLOUR = 16.0  # white is 1 for float colours: larger values are on a scale of 0 to 255
@@ -105,6 +109,7 @@ def gather_arrays(
     keep_extra: bool = False,
     statistics: RowStatistics | None = None,
     thinnest: float = math.inf,
+    context: Context = DEFAULT_CONTEXT,
 ) -> AttributeArrays:
     """Copy columns into arrays, drop rows that are not finite, and repair rotations.
 
@@ -116,6 +121,7 @@ def gather_arrays(
         keep_extra: also keep `columns.extra`.
         statistics: updated.
         thinnest: smallest scale of all discs of the file, if the blocks are only some of its rows.
+        context: threads, which copy the blocks of a large file.
 
     Returns:
         Arrays of the remaining splats.
@@ -124,13 +130,16 @@ def gather_arrays(
     statistics = RowStatistics() if statistics is None else statistics
     statistics.colour_range = columns.colour_range
     at = 0
+    threads = context.thread_count if count * dtype.itemsize > _MANY_BYTES else 1
     with np.errstate(over="ignore", invalid="ignore"):  # `_repair` detects overflow of float32
-        for rows in blocks:
-            part = _slice_arrays(out, slice(at, at + len(rows)))
-            _copy(rows, columns, part)
+        for rows, span in _copy_blocks(blocks, columns, out, threads):
+            part = _slice_arrays(out, span)
             statistics.normals += _count_nonzero_rows(rows, columns.normals)
             widths = rows[columns.filter_3d].astype(np.float64) if columns.filter_3d else None
-            at += _repair(part, columns, statistics, widths)
+            kept_count = _repair(part, columns, statistics, widths)
+            if at < span.start:  # rows before were dropped
+                _move(out, slice(span.start, span.start + kept_count), at)
+            at += kept_count
     kept = _slice_arrays(out, slice(0, at))
     if len(columns.scales) == 2 and at:
         kept.scales[:, 2] = choose_thickness(kept.scales[:, :2], thinnest)
@@ -298,6 +307,46 @@ def _slice_arrays(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
     """Return views of some rows of all arrays."""
     named = {name: array[rows] for name, array in vars(arrays).items() if name != "extra"}
     return AttributeArrays(**named, extra={name: column[rows] for name, column in arrays.extra.items()})
+
+
+def _copy_blocks(
+    blocks: Iterable[Rows], columns: ColumnMap, out: AttributeArrays, threads: int
+) -> Iterator[tuple[Rows, slice]]:
+    """Copy blocks of rows one after the other into arrays; yield each with the rows of the arrays that it takes.
+
+    Most of the time goes to memory that is touched for the first time, so threads copy the next blocks meanwhile.
+    """
+
+    def copy(rows: Rows, span: slice) -> tuple[Rows, slice]:
+        with np.errstate(over="ignore", invalid="ignore"):  # as in `gather_arrays`; a thread has its own state
+            _copy(rows, columns, _slice_arrays(out, span))
+        return rows, span
+
+    start = 0
+    if threads == 1:
+        for rows in blocks:
+            yield copy(rows, slice(start, start + len(rows)))
+            start += len(rows)
+        return
+    pending = deque[Future[tuple[Rows, slice]]]()
+    with ThreadPoolExecutor(threads) as pool:
+        for rows in blocks:
+            pending.append(pool.submit(copy, rows, slice(start, start + len(rows))))
+            start += len(rows)
+            if len(pending) > 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def _move(arrays: AttributeArrays, rows: slice, to: int) -> None:
+    """Move rows of all arrays to rows from `to` on."""
+    source, target = _slice_arrays(arrays, rows), _slice_arrays(arrays, slice(to, to + rows.stop - rows.start))
+    for name, array in vars(source).items():
+        if name != "extra":
+            getattr(target, name)[...] = array
+    for name, column in source.extra.items():
+        target.extra[name][...] = column
 
 
 def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:

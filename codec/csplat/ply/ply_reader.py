@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import plyfile
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import local_file
 from csplat.errors import InputError, counted
 from csplat.file_source import File, map_file, open_binary
@@ -72,6 +73,7 @@ def read_ply(
     keep_extra: bool = False,
     sh_degree: int | None = None,
     report: list[Finding] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> SplatModel:
     """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 4.
 
@@ -89,6 +91,7 @@ def read_ply(
         keep_extra: keep columns that are not splat attributes in `SplatModel.extra`.
         sh_degree: drop the SH bands above this degree; the file's own degree may exceed 4. `None`: keep all.
         report: findings, including repairs, are appended to this list.
+        context: threads.
 
     Examples:
         >>> import csplat
@@ -106,7 +109,7 @@ def read_ply(
     findings: list[Finding] = []
     try:
         with local_file(file) as path:
-            model = _load(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
+            model = _load(path, findings, context, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
     finally:
         if report is not None:
             report.extend(findings)
@@ -291,7 +294,7 @@ def _open(
 
 
 def _load(
-    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+    path: Path, findings: list[Finding], context: Context, *, keep_extra: bool, strict: bool, sh_degree: int | None
 ) -> SplatModel | None:
     """Read a file in one pass; return `None` if the findings contain an error."""
     ply = _open(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
@@ -299,8 +302,9 @@ def _load(
         return None
     statistics = RowStatistics()
     arrays = gather_arrays(
-        ply.blocks(), len(ply.rows), ply.rows.dtype, ply.columns, keep_extra=keep_extra, statistics=statistics
-    )
+        ply.blocks(), len(ply.rows), ply.rows.dtype, ply.columns, keep_extra=keep_extra, statistics=statistics,
+        context=context,
+    )  # fmt: skip
     findings += list_findings(statistics, len(ply.rows))
     if len(ply.rows) == 0:
         findings.append(_EMPTY)

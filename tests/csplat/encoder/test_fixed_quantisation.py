@@ -29,6 +29,8 @@ SLOW = {
     "tiles, axis": {"tile_splats": 50, "means_coding": "axis", "position_bits": 8},
     "coarse shapes": {"shape_codebook_size": 32, "attribute_psnr": 30.0},
     "small": {"preset": "small"},
+    "buckets": {**CODEBOOK, "bucket_splats": 100},
+    "buckets, adaptive": {"sh_coding": "scalar", "adaptive": 0.7, "bucket_splats": 100},
 }
 
 

@@ -21,16 +21,9 @@ from csplat import _spec
 from csplat.context import Context
 from csplat.decoder import decode_scene
 from csplat.encode_api import encode_with_report
-from csplat.encoder import EncodeOptions, Importance, kmeans
+from csplat.encoder import EncodeOptions, Importance
 from csplat.encoder.error_bounds import covariance_entries
-from csplat.encoder.kmeans import (
-    assign,
-    cluster,
-    rank_by_frequency,
-    reassign_by_metric,
-    refine_by_metric,
-    search_nearest,
-)
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, reassign_by_metric, refine_by_metric
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.shape_codebook import mean_axes, unit_covariances
 from csplat.errors import InputError
@@ -45,64 +38,10 @@ def blobs(count=3000, width=9, centres=40, spread=3.0, seed=0):
     return points, rng.random(count).astype(np.float32)
 
 
-def squared_distances(points, entries):
-    difference = points[:, None].astype(np.int64) - entries[None].astype(np.int64)
-    return (difference**2).sum(2)
-
-
 def distortion(points, weights, entries, index):
     """Return the weighted mean of squared distances of points from their entries."""
     squares = ((points.astype(np.float64) - entries[index]) ** 2).sum(1)
     return float((squares * weights).sum() / weights.sum(dtype=np.float64))
-
-
-def test_search_finds_the_first_nearest_entry():
-    rng = np.random.default_rng(1)
-    many = rng.integers(-3, 4, (200, 4)).astype(np.int16)  # many equal distances
-    sizes = (1, 2, 300, kmeans._PRODUCT_COLUMNS + 3)
-    cases = [(many, rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)) for entry_count in sizes]
-    wide = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
-    cases.append((wide, wide[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)))
-    assert kmeans._shift(*cases[-1]) == 0  # just below the bound of exact products
-    for points, entries in cases:
-        expected, (index, error) = squared_distances(points, entries), search_nearest(points, entries)
-        assert index.dtype == np.uint32
-        np.testing.assert_array_equal(expected.argmin(1), index)
-        np.testing.assert_array_equal(expected.min(1), error)
-    assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
-
-
-def test_search_for_another_entry_skips_the_own_one():
-    for entry_count in (2, 300, kmeans._PRODUCT_COLUMNS + 3):  # the last has a second block of columns
-        points = np.random.default_rng(6).integers(-9, 10, (entry_count, 4)).astype(np.int32)
-        points[-1] = points[0]
-        rows = np.unique(np.r_[0 : min(100, entry_count), max(0, entry_count - 53) : entry_count])
-        expected = squared_distances(points[rows], points)
-        expected[np.arange(len(rows)), rows] = 10**6
-        index, error = search_nearest(points, points, exclude_own=True)
-        np.testing.assert_array_equal(expected.argmin(1), index[rows])
-        np.testing.assert_array_equal(expected.min(1), error[rows])
-
-
-def test_large_points_are_assigned_to_nearly_nearest_entries():
-    rng = np.random.default_rng(3)
-    points = rng.integers(-30000, 30000, (800, 5)).astype(np.int16)
-    entries = rng.integers(-30000, 30000, (50, 5)).astype(np.int32)
-    exact = squared_distances(points, entries)
-    found = exact[np.arange(800), assign(points, entries)]
-    assert np.sqrt(found).max() > 10000
-    assert np.all(np.sqrt(found) <= np.sqrt(exact.min(1)) + 60 * np.sqrt(5))
-
-
-@pytest.mark.slow
-def test_searching_near_groups_loses_less_than_two_per_cent_and_all_groups_nothing():
-    points, _ = blobs(1000, 12, 300, 8.0)
-    entries = points[:400].astype(np.int32)
-    (_, exact), (index, error) = search_nearest(points, entries), search_nearest(points, entries, near_groups=5)
-    assert np.all(error >= exact)
-    assert error.sum() <= 1.02 * exact.sum()
-    np.testing.assert_array_equal(squared_distances(points, entries)[np.arange(1000), index], error)
-    np.testing.assert_array_equal(exact, search_nearest(points, entries, near_groups=20)[1])
 
 
 def clustered(points, weights, size, *, iterations=3, **options):
@@ -193,17 +132,6 @@ def test_ranks_follow_frequency_and_keep_the_order_of_equals():
     assert [13, 11, 10, 12, 14] == ordered.ravel().tolist()
     assert ranked.dtype == np.uint32
     np.testing.assert_array_equal(entries[index], ordered[ranked])
-
-
-@pytest.mark.slow
-def test_the_thread_count_of_blas_is_restored():
-    control = kmeans._openblas()
-    if control is None:
-        pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
-    before = control[0]()
-    with kmeans.one_blas_thread():
-        assert control[0]() == 1
-    assert control[0]() == before
 
 
 def test_reassigning_over_all_entries_finds_the_best():
@@ -318,10 +246,11 @@ def digests(threads):
 
 
 @pytest.mark.slow
-def test_threads_of_csplat_and_blas_do_not_change_the_bytes():
-    # The threads of an OpenBLAS that is not found cannot be set.
-    code = f"import runpy; m = runpy.run_path({__file__!r}); m['kmeans']._openblas = lambda: None"
+def test_neither_threads_nor_compiled_code_change_the_bytes(tmp_path):
+    # The threads of an OpenBLAS that is not found cannot be set; an empty folder has no compiled library.
+    code = "from csplat.encoder import entry_search; entry_search._openblas = lambda: None; import runpy"
     environment = {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", f"{code}; print(m['digests'](3))"]
+    environment["CSPLAT_NATIVE_FOLDER"] = str(tmp_path)
+    command = [sys.executable, "-c", f"{code}; print(runpy.run_path({__file__!r})['digests'](3))"]
     other = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
     assert digests(1) == digests(2) == ast.literal_eval(other.stdout)

@@ -16,6 +16,7 @@ from ply_cases import ARRAYS, assert_same_scene, columns_of, header_of
 from tables import failures
 
 from csplat import decode, encode
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
 from csplat.ply.columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
@@ -299,6 +300,23 @@ def test_reading_allocates_little_more_than_the_arrays(tmp_path):
     tracemalloc.stop()
     size = sum(getattr(model, name).nbytes for name in (*ARRAYS, "opacities"))
     assert peak < size + 16e6
+
+
+@pytest.mark.slow
+def test_threads_change_neither_splats_nor_findings(tmp_path):
+    path, count = tmp_path / "a.ply", 80_000  # 20 MB
+    names, rows = columns_of(3), np.tile(random_rows(columns_of(3), 1000), (count // 1000, 1))
+    rows[:, names.index("x")] = np.arange(count)
+    bad = np.r_[3, 9000:14000, 40_000, count - 1]  # a few, a block and more
+    rows[bad, names.index("f_dc_1")] = np.nan
+    write_rows(path, names, rows)
+    one, several = [], []
+    expected = read_ply(path, report=one, context=Context(threads=1))
+    model = read_ply(path, report=several, context=Context(threads=3))
+    assert np.array_equal(np.delete(np.arange(count), bad), expected.means[:, 0])
+    assert one == several
+    for name in (*ARRAYS, "opacities"):
+        assert np.array_equal(getattr(expected, name), getattr(model, name)), name
 
 
 @pytest.mark.parametrize(("name", "count", "degree"), [

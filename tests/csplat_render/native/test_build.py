@@ -19,7 +19,13 @@ SOURCES = ROOT / "trainer" / "csplat_render" / "native"
 SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 LEAST = ("build.py", "library.cpp", "library.h", "threads.h")
 #: Tests that reach the functions of the library, for sanitizers.
-THOROUGH = ("test_kernels.py", "test_rasteriser.py", "test_metric_kernels.py", "test_neighbours.py")
+THOROUGH = (
+    "test_kernels.py",
+    "test_rasteriser.py",
+    "test_metric_kernels.py",
+    "test_neighbours.py",
+    "test_nearest_entries.py",
+)
 
 #: Scripts that print a digest of results.
 DIGESTS = ("csplat_trainer/test_losses.py",)

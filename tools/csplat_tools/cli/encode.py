@@ -149,7 +149,7 @@ def encode(
                 require_renderer()
             scene = read_source(
                 source, overrides, format=read_as, keep_extra=keep_extra, sh_degree=read_degree(options),
-                progress=progress,
+                context=context,
             )  # fmt: skip
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))

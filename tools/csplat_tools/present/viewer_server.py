@@ -341,7 +341,7 @@ def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -
     Raises:
         CsplatError: the scene is not valid.
     """
-    source = read_source(str(path), progress=context.progress)
+    source = read_source(str(path), context=context)
     data = encode(source.model(), EncodeOptions(preset=preset), context=context)
     header, up = read_header(data), estimate_up(source.model())
     return ViewerScene(f"{stem}.csplat", data, len(data), header, up, tuple(source.findings), source.size_bytes)

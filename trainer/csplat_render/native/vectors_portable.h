@@ -16,6 +16,7 @@ typedef int32_t IntVector __attribute__((vector_size(32)));
 typedef int64_t LongVector __attribute__((vector_size(32)));
 
 struct Floats { FloatVector v; };
+struct Ints { IntVector v; };
 struct Mask { IntVector v; };  // −1 or 0
 struct Doubles { DoubleVector v; };
 struct DoubleMask { LongVector v; };
@@ -83,6 +84,20 @@ inline Doubles floor(Doubles a) {
   return a;
 }
 inline double first_lane(Doubles a) { return a.v[0]; }
+
+inline Ints load(const int32_t* p) {
+  Ints a;
+  std::memcpy(&a.v, p, sizeof a.v);
+  return a;
+}
+inline void store(int32_t* p, Ints a) { std::memcpy(p, &a.v, sizeof a.v); }
+inline Ints all(int32_t a) { return {a - IntVector{}}; }
+inline Ints add_products(Ints sum, Ints a, Ints b) {
+  return {sum.v + (a.v << 16 >> 16) * (b.v << 16 >> 16) + (a.v >> 16) * (b.v >> 16)};
+}
+inline Mask above(Ints a, Ints b) { return {a.v > b.v}; }
+inline Mask equal(Ints a, Ints b) { return {a.v == b.v}; }
+inline Ints select(Mask m, Ints a, Ints b) { return {m.v ? a.v : b.v}; }
 
 inline Mask at_least(Floats a, Floats b) { return {a.v >= b.v}; }
 inline Floats select(Mask m, Floats a, Floats b) { return {m.v ? a.v : b.v}; }

@@ -4,6 +4,7 @@
 #include <immintrin.h>
 
 #include <cstdint>
+#include <cstring>
 
 namespace csplat {
 
@@ -11,15 +12,19 @@ namespace csplat {
 
 constexpr int kFloats = 16;  // lanes of a register of floats
 struct Floats { __m512 v; };
+struct Ints { __m512i v; };
 using Mask = __mmask16;
 #define CSPLAT_PS(name) _mm512_##name##_ps
+#define CSPLAT_SI(name) _mm512_##name
 
 #else
 
 constexpr int kFloats = 8;
 struct Floats { __m256 v; };
+struct Ints { __m256i v; };
 struct Mask { __m256 v; };
 #define CSPLAT_PS(name) _mm256_##name##_ps
+#define CSPLAT_SI(name) _mm256_##name
 
 #endif
 
@@ -65,9 +70,24 @@ inline Doubles floor(Doubles a) { return {_mm256_floor_pd(a.v)}; }
 inline double first_lane(Doubles a) { return _mm256_cvtsd_f64(a.v); }
 inline void store(float* p, Eights a) { _mm256_storeu_ps(p, a.v); }
 
+inline Ints load(const int32_t* p) {
+  Ints a;
+  std::memcpy(&a.v, p, sizeof a.v);
+  return a;
+}
+inline void store(int32_t* p, Ints a) { std::memcpy(p, &a.v, sizeof a.v); }
+inline Ints all(int32_t a) { return {CSPLAT_SI(set1_epi32)(a)}; }
+// Returns a sum and the products of both halves of each lane, which are 16-bit integers.
+inline Ints add_products(Ints sum, Ints a, Ints b) {
+  return {CSPLAT_SI(add_epi32)(sum.v, CSPLAT_SI(madd_epi16)(a.v, b.v))};
+}
+
 #ifdef __AVX512F__
 
 inline Mask at_least(Floats a, Floats b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
+inline Mask above(Ints a, Ints b) { return _mm512_cmpgt_epi32_mask(a.v, b.v); }
+inline Mask equal(Ints a, Ints b) { return _mm512_cmpeq_epi32_mask(a.v, b.v); }
+inline Ints select(Mask m, Ints a, Ints b) { return {_mm512_mask_blend_epi32(m, b.v, a.v)}; }
 inline Floats select(Mask m, Floats a, Floats b) { return {_mm512_mask_blend_ps(m, b.v, a.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm512_maskz_mov_ps(m, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm512_maskz_mov_ps(static_cast<Mask>(~m), a.v)}; }
@@ -98,6 +118,9 @@ inline Eights fold(const Floats* parts) {
 #else
 
 inline Mask at_least(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
+inline Mask above(Ints a, Ints b) { return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(a.v, b.v))}; }
+inline Mask equal(Ints a, Ints b) { return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(a.v, b.v))}; }
+inline Ints select(Mask m, Ints a, Ints b) { return {_mm256_blendv_epi8(b.v, a.v, _mm256_castps_si256(m.v))}; }
 inline Floats select(Mask m, Floats a, Floats b) { return {_mm256_blendv_ps(b.v, a.v, m.v)}; }
 inline Floats keep(Mask m, Floats a) { return {_mm256_and_ps(m.v, a.v)}; }
 inline Floats drop(Mask m, Floats a) { return {_mm256_andnot_ps(m.v, a.v)}; }
