@@ -228,13 +228,18 @@ class TargetSearch:
 
         Brief refits correct the prediction of the pruning order, and the whole refit corrects theirs.
         """
-        kept_count, turn = self._best_count(pruner), 0
+        kept_count, turn, costs = self._best_count(pruner), 0, dict[int, float]()
         while True:
             part, rest_gain = REFITS[turn]
             subset, coding = pruner.refit(kept_count, part), None
             if self.goal.size_bytes is not None or self.goal.images is not None:  # what files of the goal are like
                 coding = self._choose_coding(subset, len(self._first_codings(subset)))
-            previous_count, kept_count = kept_count, self._best_count(pruner, subset, rest_gain, coding)
+            previous_count = kept_count
+            kept_count = self._best_count(pruner, subset, rest_gain if pruner.refits else 0.0, coding)
+            if coding is not None:
+                costs[previous_count] = self._predict(subset, coding)[1]
+                cheapest = min(costs, key=costs.__getitem__)
+                kept_count = kept_count if cheapest == previous_count else cheapest
             is_near = abs(kept_count - previous_count) <= _WORTH * kept_count
             is_whole = part > 1.0 or len(subset.model) == len(self.whole.model)
             turn += 1
