@@ -25,7 +25,7 @@ _RENDER, _FILE_STEP, _SENSITIVITY, _DRAFT, _FILE, _SCORES = 1.25, 1.7, 3.7, 100.
 _LEVELS = 16_000.0  # cost of levels of detail for each splat, in the unit of plans
 
 # Usual numbers in these searches; pairs are without and with SH.
-_FILES = (3.0, 2.5)
+_FILES = (3.0, 3.0)
 _DRAFTS, _DRAFTS_OF_SIZE = (3.0, 9.0), (3.0, 16.0)
 _FILES_OF_ALL = (3.5, 9.0)  # without pruning
 _LEVELLED = (1.0, 2.0)  # files with levels of detail, for a fraction of the splats and for other targets
