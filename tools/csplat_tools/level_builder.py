@@ -26,6 +26,7 @@ from csplat.encoder import (
     EncodeOptions,
     EncodePlan,
     FileCodebooks,
+    LevelCoding,
     LevelNode,
     bucket_rows,
     encode_levels,
@@ -97,58 +98,72 @@ class FittedLevelBuilder:
 
     def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
-        nodes = self.build(plan.model, plan.context) if self.nodes is None else self.nodes
+        if codebooks is None:
+            plan, codebooks = plan.choose_sh_coding()
+        coding = LevelCoding(plan, codebooks)
+        nodes = self.build(coding.scene, plan.context, coding) if self.nodes is None else self.nodes
         return self.measure(encode_levels(plan, nodes, codebooks), plan.context)
 
-    def build(self, model: SplatModel, context: Context = DEFAULT_CONTEXT) -> list[LevelNode]:
+    def build(
+        self, model: SplatModel, context: Context = DEFAULT_CONTEXT, coding: LevelCoding | None = None
+    ) -> list[LevelNode]:
         """Build the nodes of a scene. Their errors are 0 until `measure` is called.
 
         Args:
             model: the scene.
             context: threads and progress.
+            coding: how the file codes levels.
         """
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
             from csplat_tools.level_fitting import LevelFitter
 
+            scene = _plain(model)
             with thread_count(context.threads):
-                return self._build_leaves(model, LevelFitter(_plain(model), context=context).fit, self.count)
+                return self._build_leaves(scene, LevelFitter(scene, coding=coding, context=context).fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), len(model), silent)
+            part = self.build_part(model.select(rows), len(model), silent, coding)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_renumber(node, len(nodes), rows) for node in part]
             context.progress("building levels", (done + 1) / len(buckets))
-        parents, top = self.build_top(roots, context)
+        parents, top = self.build_top(roots, context, coding)
         for own, parent in zip(numbers, parents, strict=False):
             for number in own:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_renumber(node, len(nodes)) for node in top]
 
-    def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
+    def build_part(
+        self, splats: SplatModel, scene_count: int, context: Context, coding: LevelCoding | None = None
+    ) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
 
         Args:
             splats: the bucket.
             scene_count: number of splats of the scene.
             context: threads and progress.
+            coding: how the file codes levels.
         """
         from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
-        fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, context=context)
+        splats = _plain(splats)
+        fitter = LevelFitter(splats, is_part=True, work=PART_WORK, coding=coding, context=context)
         fit = fitter.fit if scene_count <= self.fitted_splats else _merge_only
         with thread_count(context.threads):
             return self._build_leaves(splats, fit, self._part_levels)
 
-    def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
+    def build_top(
+        self, roots: Iterable[SplatModel], context: Context, coding: LevelCoding | None = None
+    ) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
 
         Args:
             roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
             context: threads and progress.
+            coding: how the file codes levels.
 
         Returns:
             The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
@@ -161,7 +176,7 @@ class FittedLevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        fitter = LevelFitter(scene, is_part=True, context=context)
+        fitter = LevelFitter(scene, is_part=True, coding=coding, context=context)
         with thread_count(context.threads):
             nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
@@ -187,7 +202,7 @@ class FittedLevelBuilder:
         for place, rows in enumerate(groups):
             places[rows] = place
         nodes = [LevelNode(0, None, rows=rows) for rows in groups]
-        return self._add_levels(nodes, _plain(splats), places, fit, last)
+        return self._add_levels(nodes, splats, places, fit, last)
 
     def _add_levels(
         self, nodes: list[LevelNode], splats: SplatModel, places: I64, fit: _Fit, last: int | None

@@ -8,16 +8,17 @@ merged. Work is bounded.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.encoder import LevelCoding
 from csplat.errors import LimitError
 from csplat.model import SplatModel
-from csplat.types import I64, null_progress
-from csplat_render.camera import Camera
-from csplat_render.scorer import Scorer, renderer
+from csplat.types import F32, I64
+from csplat_render.camera import Camera, resized
+from csplat_render.scorer import ReferenceImage, Scorer, renderer
 from csplat_tools.level_merging import light_of, merge_neighbours
 from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_outside
 from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
@@ -48,14 +49,14 @@ class Work:
 
 
 #: Work on the levels of a whole scene. With half of it, levels 1 and 2 are clearly worse.
-SCENE_WORK = Work(6e7, (40, 120), 7.5e7, (100, 1600))
+SCENE_WORK = Work(1e8, (40, 160), 1.2e8, (100, 1600))
 #: Work on the levels of a bucket, less than on a scene. More views hardly help; coarser levels need more steps.
 PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class LevelFitter:
-    """Fits levels of a scene.
+    """Fits levels of a scene, one after the other, in the same views.
 
     Attributes:
         scene: a scene or a part of a scene, in whose renders levels are measured.
@@ -63,13 +64,18 @@ class LevelFitter:
             Choosing splats would leave holes where no view sees anything. Views as of whole scenes suit some scenes,
             and make the levels of others worse.
         work: how much is done.
+        coding: how the file codes levels; splats are fitted around the SH that the file will have. `None`: unknown.
         context: threads and progress.
     """
 
     scene: SplatModel
     is_part: bool = False
     work: Work = SCENE_WORK
+    coding: LevelCoding | None = None
     context: Context = DEFAULT_CONTEXT
+    _cameras: list[Camera] = field(default_factory=list, init=False)  # the first `_held_out` are not fitted to
+    _held_out: int = field(default=0, init=False)
+    _renders: dict[int, F32] = field(default_factory=dict, init=False)  # [H, W, 3], of the scene in these views
 
     def fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
         """Choose or merge splats, and refit them. Only merge them if a view has too many to be rendered.
@@ -78,64 +84,83 @@ class LevelFitter:
             finer: the next finer level.
             nodes: [N], the node to which each splat of `finer` goes.
             count: number of splats to keep, about a quarter; each node keeps at least one.
-            level: the level, from 1; its views are 2^level times smaller than views of the scene.
+            level: the level, from 1, one more than in the last call.
 
         Returns:
             The node of each splat of the level, and the splats.
         """
+        self._place_views(level)
         try:
-            return self._fit(finer, nodes, count, level)
+            return self._fit(finer, nodes, count)
         except LimitError:
             return merge_neighbours(finer, nodes, count)
 
-    def _fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
+    def _fit(self, finer: SplatModel, nodes: I64, count: int) -> tuple[I64, SplatModel]:
         """Fit a level as `fit` does. The refit is discarded if it makes held-out views worse.
 
         Raises:
             LimitError: a view has too many splats to be rendered.
         """
-        used, check = self._cameras(len(finer), level)
         if self.is_part:
             nodes, chosen = merge_neighbours(finer, nodes, count)
         else:
-            rows = self._choose_rows(finer, nodes, count, used)
+            rows = self._choose_rows(finer, nodes, count)
             nodes, chosen = nodes[rows], finer.select(rows)
-        steps = _clip_rounded(self.work.splats_to_move / len(chosen), self.work.steps)
+        if self.coding is not None:
+            chosen = self.coding.with_coded_sh(chosen)
         draw = renderer(self.scene, (0.0, 0.0, 0.0), context=self.context)
-        renders = [draw(camera).rgb for camera in used]
-        fitted = refit_splats(chosen, used, renders, steps=steps, moves=True, context=self.context)
-        scorer = Scorer.of_source(self.scene, check, context=replace(self.context, progress=null_progress))
+        for number, camera in enumerate(self._cameras):
+            if number not in self._renders:
+                self._renders[number] = draw(camera).rgb
+        renders = [self._renders[number] for number in range(len(self._cameras))]
+        used, held_out = slice(self._held_out, None), slice(self._held_out)
+        steps = _clip_rounded(self.work.splats_to_move / len(chosen), self.work.steps)
+        fitted = refit_splats(
+            chosen, self._cameras[used], renders[used], steps=steps, moves=True, context=self.context
+        )  # fmt: skip
+        scorer = Scorer(self._cameras[held_out], list(map(ReferenceImage, renders[held_out])), context=self.context)
         return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
 
-    def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:
-        """Return views for a level, half as wide for each coarser one, and `HELD_OUT_COUNT` or fewer held-out views."""
+    def _place_views(self, level: int) -> None:
+        """Place the views of level 1; views of each coarser level are half as wide."""
         widest = _clip_rounded(math.sqrt(_PIXELS_PER_SPLAT * len(self.scene) / 3.0), _WIDTHS)
         width = max(_LEAST_WIDTH, widest >> (level - 1))
-        views = _clip_rounded(self.work.splats_to_measure / finer_count, self.work.views)
-        checks = min(views // _CHECKS_EVERY, HELD_OUT_COUNT)
+        size = width, width * 3 // 4
+        self._renders = {}
+        if level > 1:
+            self._cameras = [resized(camera, *size) for camera in self._cameras]
+            return
+        views = _clip_rounded(self.work.splats_to_measure / len(self.scene), self.work.views)
+        self._held_out = min(views // _CHECKS_EVERY, HELD_OUT_COUNT)
         place = cameras_outside if self.is_part else camera_sequence
-        cameras = place(self.scene, views + checks, (width, width * 3 // 4))
-        return cameras[checks:], cameras[:checks]
+        self._cameras = place(self.scene, views + self._held_out, size)
 
-    def _choose_rows(self, finer: SplatModel, nodes: I64, count: int, cameras: list[Camera]) -> I64:
+    def _choose_rows(self, finer: SplatModel, nodes: I64, count: int) -> I64:
         """Return the ascending rows, int64, of about `count` splats that matter most in views, at least one by node.
+
+        Renders of the scene are kept on the way.
 
         Args:
             finer: the splats to choose from.
             nodes: [N], the node of each splat.
             count: number of splats; more are chosen if nodes would have none.
-            cameras: the views.
         """
+        numbers = [range(first, len(self._cameras), 2) for first in (self._held_out, self._held_out + 1)]
         groups = [
-            MeasuredViews.of(finer, part, (0.0, 0.0, 0.0), context=self.context)
-            for part in (cameras[::2], cameras[1::2])
-        ]
+            MeasuredViews.of(
+                finer, [self._cameras[number] for number in part], (0.0, 0.0, 0.0),
+                keep_renders=finer is self.scene, context=self.context,
+            )
+            for part in numbers
+        ]  # fmt: skip
+        for part, group in zip(numbers, groups, strict=True):
+            self._renders |= zip(part, group.renders, strict=False)  # there are none at coarser levels
         # No view tells unseen splats apart: the same fraction is kept, with the largest opacity times area.
         light = light_of(finer)
         unseen = np.flatnonzero(~total_error(groups).seen)
         unseen = unseen[np.argsort(-light[unseen], kind="stable")]
         remaining = np.delete(np.arange(len(finer)), unseen[len(unseen) * count // len(finer) :])
-        groups = [replace(group, pruning_error=group.pruning_error.of_rows(remaining)) for group in groups]
+        groups = [MeasuredViews(group.cameras, group.pruning_error.of_rows(remaining)) for group in groups]
         order = PruningOrder(finer.select(remaining), groups, context=self.context)
         rows = remaining[order.kept(count)]
         by_node = np.lexsort((light, nodes))
