@@ -311,7 +311,7 @@ def test_encode_writes_levels(tmp_path, model):
     assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
     for word in ("17", "none", "0", "-1"):
         refused = call("encode", source, out, "--force", f"--levels={word}", status=2)
-        assert "expected auto or 1 to 16" in " ".join(refused.output.split())
+        assert "expected auto, merged or 1 to 16" in " ".join(refused.output.split())
 
 
 @pytest.mark.slow
@@ -385,6 +385,18 @@ def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merg
     assert builder.seconds(5001) < builder.seconds(5000)
 
 
+@pytest.mark.slow
+def test_merged_levels_are_merged_alone_in_scenes_of_any_size(model):
+    fitted, merged = (FittedLevelBuilder(2, SPLATS, bucket_splats=300, fits=fits) for fits in (True, False))
+    assert ("fitted", "merged") == tuple(builder.settings(SPLATS)["splats"] for builder in (fitted, merged))
+    assert merged.seconds(SPLATS) < fitted.seconds(SPLATS)
+    level = quarter(model)
+    for parts in (merged.build(model), merged.build_part(model, SPLATS, Context(threads=1))):
+        assert same(level, parts[1].splats)
+    (top,) = merged.build_top([level], Context(threads=1))[1]
+    assert same(quarter(level), top.splats)
+
+
 def test_the_suite_of_encoders_reports_how_levels_look(model, data):
     case = next(one for one in all_inputs() if one.renders)
     scene, pairs = decode_scene(data), SplatPairs(np.arange(len(model)), 0, 0, 0)
@@ -404,10 +416,12 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
         (4096, "auto"): None,
         (4097, "auto"): FittedLevelBuilder(),
         (9, 2): FittedLevelBuilder(2),
+        (4096, "merged"): None,
+        (4097, "merged"): FittedLevelBuilder(fits=False),
     }
     assert wanted == {(count, levels): choose_levels(count, EncodeOptions(), levels) for count, levels in wanted}
     for levels in (0, 17):
-        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, or auto"):
+        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, auto or merged"):
             choose_levels(9, EncodeOptions(), levels)
     hide_renderer(monkeypatch)
     assert choose_levels(10**6, EncodeOptions(), None) is None

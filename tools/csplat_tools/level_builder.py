@@ -54,7 +54,7 @@ _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
 #: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
 LEVELS_MAX = 16
 
-LevelCount = int | Literal["auto"] | None
+LevelCount = int | Literal["auto", "merged"] | None
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ class FittedLevelBuilder:
         fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
             scenes, neighbours are only merged. On two cores, 100 million splats would take 75 to 90 minutes with the
             fit, and 40 million take 30 to 35.
+        fits: levels are fitted to renders; otherwise, neighbours are only merged in scenes of any size.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """
@@ -79,6 +80,7 @@ class FittedLevelBuilder:
     root_splats: int = 1 << 12
     whole_splats: int = 2_000_000
     fitted_splats: int = 40_000_000
+    fits: bool = True
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
 
@@ -87,14 +89,17 @@ class FittedLevelBuilder:
         if self.nodes is not None:
             return {"splats": "of the source"}
         size = {"root_splats": self.root_splats} if self.count is None else {"count": self.count}
-        made = "fitted" if count <= max(self.whole_splats, self.fitted_splats) else "merged"
+        made = "fitted" if self._is_fitted(count) else "merged"
         return {"splats": made, "leaf_splats": self.leaf_splats, **size}
 
     def seconds(self, count: int) -> float:
         """Return the approximate time for the levels of a scene of `count` splats, by one process."""
-        if count <= self.whole_splats:
-            return count * _SECONDS_WHOLE
-        return count * (_SECONDS_FITTED if count <= self.fitted_splats else _SECONDS_MERGED)
+        fitted = _SECONDS_WHOLE if count <= self.whole_splats else _SECONDS_FITTED
+        return count * (fitted if self._is_fitted(count) else _SECONDS_MERGED)
+
+    def _is_fitted(self, count: int) -> bool:
+        """Return True if the levels of a scene of `count` splats, or of its buckets, are fitted to renders."""
+        return self.fits and count <= max(self.whole_splats, self.fitted_splats)
 
     def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
@@ -120,8 +125,9 @@ class FittedLevelBuilder:
             from csplat_tools.level_fitting import LevelFitter
 
             scene = _plain(model)
+            fit = LevelFitter(scene, coding=coding, context=context).fit if self.fits else _merge_only
             with thread_count(context.threads):
-                return self._build_leaves(scene, LevelFitter(scene, coding=coding, context=context).fit, self.count)
+                return self._build_leaves(scene, fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
         for done, rows in enumerate(buckets):
@@ -151,7 +157,7 @@ class FittedLevelBuilder:
 
         splats = _plain(splats)
         fitter = LevelFitter(splats, is_part=True, work=PART_WORK, coding=coding, context=context)
-        fit = fitter.fit if scene_count <= self.fitted_splats else _merge_only
+        fit = fitter.fit if self._is_fitted(scene_count) else _merge_only
         with thread_count(context.threads):
             return self._build_leaves(splats, fit, self._part_levels)
 
@@ -178,7 +184,7 @@ class FittedLevelBuilder:
         scene = join_blocks(parts[0], parts)
         fitter = LevelFitter(scene, is_part=True, coding=coding, context=context)
         with thread_count(context.threads):
-            nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
+            nodes = self._add_levels(nodes, scene, places, fitter.fit if self.fits else _merge_only, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -238,9 +244,10 @@ def choose_levels(count: int, options: EncodeOptions, levels: LevelCount) -> Fit
         InputError: the number of levels is out of range, or the renderer is not installed.
     """
     if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
-        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")
-    builder = FittedLevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
-    if levels is None or not count or (levels == "auto" and count <= builder.root_splats):
+        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, auto or merged")
+    number = levels if isinstance(levels, int) else None
+    builder = FittedLevelBuilder(number, bucket_splats=options.bucket_splats, fits=levels != "merged")
+    if levels is None or not count or (number is None and count <= builder.root_splats):
         return None
     require_renderer()
     return builder

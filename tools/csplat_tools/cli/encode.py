@@ -49,7 +49,7 @@ def encode(
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     levels: Annotated[
-        str | None, typer.Option(metavar="LEVELS", help="Levels: auto, or 1 to 16. Default: none.")
+        str | None, typer.Option(metavar="LEVELS", help="auto, merged, or 1 to 16. Default: none.")
     ] = None,
     up: shared.HiddenUp = None,
     attribute_psnr: Annotated[
@@ -96,8 +96,9 @@ def encode(
     save 1 % of the bytes per 10 CPU seconds. --max-error limits errors of means,
     covariance, opacities, sh0 to sh4. Views are virtual without --data, which
     requires the render extra, or --cameras. --levels adds coarser versions of
-    the scene, which viewers show first: 35 % more bytes, and minutes. --help-all
-    shows --keep, --cameras, --up and all other options.
+    the scene, which viewers show first: 35 % more bytes, and minutes, or seconds
+    with worse ones for merged. --help-all shows --keep, --cameras, --up and all
+    other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
