@@ -73,8 +73,8 @@ def path(data, tmp_path):
     return tmp_path / "levels.csplat"
 
 
-def quarter(splats):
-    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
+def quarter(splats, neighbours=8):
+    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4), neighbours)[1]
 
 
 def same(one, other):
@@ -381,7 +381,7 @@ def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merg
     assert (0, ()) == (header.splat_count, header.all_tiles)
     builder = FittedLevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
     fitted, merged = (builder.build_part(model, count, Context(threads=1))[1].splats for count in (5000, 5001))
-    assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
+    assert (True, False) == tuple(same(quarter(model, 4), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
 
 
@@ -390,11 +390,11 @@ def test_merged_levels_are_merged_alone_in_scenes_of_any_size(model):
     fitted, merged = (FittedLevelBuilder(2, SPLATS, bucket_splats=300, fits=fits) for fits in (True, False))
     assert ("fitted", "merged") == tuple(builder.settings(SPLATS)["splats"] for builder in (fitted, merged))
     assert merged.seconds(SPLATS) < fitted.seconds(SPLATS)
-    level = quarter(model)
+    level = quarter(model, 4)
     for parts in (merged.build(model), merged.build_part(model, SPLATS, Context(threads=1))):
         assert same(level, parts[1].splats)
     (top,) = merged.build_top([level], Context(threads=1))[1]
-    assert same(quarter(level), top.splats)
+    assert same(quarter(level, 4), top.splats)
 
 
 def test_the_suite_of_encoders_reports_how_levels_look(model, data):
