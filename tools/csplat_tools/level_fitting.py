@@ -52,7 +52,7 @@ class Work:
     steps: tuple[int, int]
 
 
-#: Work on the levels of a whole scene: 130 CPU s for a million splats. With half of it, level 1 is clearly worse.
+#: Work on the levels of a whole scene: 125 CPU s for a million splats. With half of it, level 1 is clearly worse.
 SCENE_WORK = Work(8e7, (40, 160), 1.2e8, (100, 1600))
 #: Work on the levels of a bucket, less than on a scene. More views hardly help; coarser levels need more steps.
 PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))

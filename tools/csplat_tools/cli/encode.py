@@ -96,9 +96,9 @@ def encode(
     save 1 % of the bytes per 10 CPU seconds. --max-error limits errors of means,
     covariance, opacities, sh0 to sh4. Views are virtual without --data, which
     requires the render extra, or --cameras. --levels adds coarser versions of
-    the scene, which viewers show first: 35 % more bytes, and minutes, or seconds
-    with worse ones for merged. --help-all shows --keep, --cameras, --up and all
-    other options.
+    the scene, which viewers show first: 35 % more bytes, and minutes; merged
+    takes seconds, and looks worse. --help-all shows --keep, --cameras, --up and
+    all other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
