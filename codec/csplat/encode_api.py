@@ -24,8 +24,9 @@ from csplat.out_of_core import encode_on_disk, estimate_cost
 from csplat.plugins import load_plugins
 from csplat.scene import Scene
 
-#: Levels of detail: their number above the scene, "auto" for as many as it takes to reach 4,096 splats, or a builder.
-Levels = int | Literal["auto"] | LevelBuilder | None
+#: Levels of detail: their number above the scene; "auto" for as many as it takes to reach 4,096 splats, "merged" for
+#: the same without a fit to renders; or a builder.
+Levels = int | Literal["auto", "merged"] | LevelBuilder | None
 
 Output = str | os.PathLike[str] | BinaryWriter
 
@@ -104,8 +105,9 @@ def encode(
         views: a `csplat_tools.ViewSet` of training, validation and test views for the search; `None`: virtual ones
             around the scene.
         importance: see `EncodePlan.of`; requires the scene in memory.
-        levels: number of levels of detail above the scene, 1 to 16, "auto" or a builder; their bytes count for a
-            target. Building them takes minutes per million splats. `None`: the file has none.
+        levels: number of levels of detail above the scene, 1 to 16, "auto", "merged" or a builder (see `Levels`);
+            their bytes count for a target. Building them takes minutes per million splats, and merged ones 20 seconds.
+            `None`: the file has none.
         context: threads, workers, memory, seed and progress.
 
     Returns:

@@ -83,8 +83,8 @@ def test_levels_report_the_whole_of_their_work(model):
     assert [f"levels: refitting splats of level {level}" for level in (1, 2)] == fitted
 
 
-def quarter(splats):
-    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
+def quarter(splats, neighbours=8):
+    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4), neighbours)[1]
 
 
 def same(one, other):
@@ -321,7 +321,7 @@ def test_encode_writes_levels(tmp_path, model):
     assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
     for word in ("17", "none", "0", "-1"):
         refused = call("encode", source, out, "--force", f"--levels={word}", status=2)
-        assert "expected auto or 1 to 16" in " ".join(refused.output.split())
+        assert "expected auto, merged or 1 to 16" in " ".join(refused.output.split())
 
 
 @pytest.mark.slow
@@ -391,8 +391,20 @@ def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merg
     assert (0, ()) == (header.splat_count, header.all_tiles)
     builder = FittedLevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
     fitted, merged = (builder.build_part(model, count, Context(threads=1))[1].splats for count in (5000, 5001))
-    assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
+    assert (True, False) == tuple(same(quarter(model, 4), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
+
+
+@pytest.mark.slow
+def test_merged_levels_are_merged_alone_in_scenes_of_any_size(model):
+    fitted, merged = (FittedLevelBuilder(2, SPLATS, bucket_splats=300, fits=fits) for fits in (True, False))
+    assert ("fitted", "merged") == tuple(builder.settings(SPLATS)["splats"] for builder in (fitted, merged))
+    assert merged.seconds(SPLATS) < fitted.seconds(SPLATS)
+    level = quarter(model, 4)
+    for parts in (merged.build(model), merged.build_part(model, SPLATS, Context(threads=1))):
+        assert same(level, parts[1].splats)
+    (top,) = merged.build_top([level], Context(threads=1))[1]
+    assert same(quarter(level, 4), top.splats)
 
 
 def test_the_suite_of_encoders_reports_how_levels_look(model, data):
@@ -414,10 +426,12 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
         (4096, "auto"): None,
         (4097, "auto"): FittedLevelBuilder(),
         (9, 2): FittedLevelBuilder(2),
+        (4096, "merged"): None,
+        (4097, "merged"): FittedLevelBuilder(fits=False),
     }
     assert wanted == {(count, levels): choose_levels(count, EncodeOptions(), levels) for count, levels in wanted}
     for levels in (0, 17):
-        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, or auto"):
+        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, auto or merged"):
             choose_levels(9, EncodeOptions(), levels)
     hide_renderer(monkeypatch)
     assert choose_levels(10**6, EncodeOptions(), None) is None

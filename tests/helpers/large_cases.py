@@ -32,12 +32,12 @@ class EveryFourth:
     def seconds(self, count):
         return 1e-5 * count
 
-    def build_part(self, splats, scene_count, context):
+    def build_part(self, splats, scene_count, context, coding):  # noqa: ARG002 - of the protocol
         assert (COUNT, 1) == (scene_count, context.threads)
         coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
         return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
 
-    def build_top(self, roots, context):
+    def build_top(self, roots, context, coding):  # noqa: ARG002 - of the protocol
         parts = list(roots)
         context.progress("building levels", 1.0)
         scene = join_blocks(parts[0], parts)

@@ -124,7 +124,8 @@ def encode_file(
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
         levels: number of levels of detail above the scene, 1 to 16; "auto": until the coarsest has 4,096 splats;
-            `None`: none. Levels of streamed SOG are taken instead, unless splats may be pruned.
+            "merged": the same without a fit to renders; `None`: none. Levels of streamed SOG are taken instead, unless
+            splats may be pruned.
         format: as for `csplat.open`.
 
     Raises:

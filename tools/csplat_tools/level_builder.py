@@ -26,6 +26,7 @@ from csplat.encoder import (
     EncodeOptions,
     EncodePlan,
     FileCodebooks,
+    LevelCoding,
     LevelNode,
     bucket_rows,
     encode_levels,
@@ -43,10 +44,12 @@ from csplat_tools.planned_progress import Plan, PlannedProgress, PlannedWork
 
 _KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
-# Seconds per splat to build levels and measure their errors: scenes in one piece, and buckets.
-_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
+# Seconds per splat to build levels and measure their errors, of SH degree 3: scenes in one piece on two threads, and
+# buckets on one thread.
+_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 1e-4, 3.5e-5, 1.8e-5
 # Costs of each report for a splat, in the unit of plans: of buckets, and of coding and measuring levels.
 _BUILDING_COST, _CODING_COST = 4000.0, 100.0
+_QUICK_NEIGHBOURS = 4  # without a fit; 8 gain 0 to 0.4 dB at level 1 (lego60k, garden500k)
 _ROUNDING = 1e-9  # more than the rounding error of a logarithm, so that an exact power needs no further level
 
 #: A function that makes the splats of a level, and the node of each. Its arguments are as for `LevelFitter.fit`.
@@ -56,7 +59,7 @@ _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
 #: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
 LEVELS_MAX = 16
 
-LevelCount = int | Literal["auto"] | None
+LevelCount = int | Literal["auto", "merged"] | None
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ class FittedLevelBuilder:
         fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
             scenes, neighbours are only merged. On two cores, 100 million splats would take 75 to 90 minutes with the
             fit, and 40 million take 30 to 35.
+        fits: levels are fitted to renders; otherwise, neighbours are only merged in scenes of any size.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """
@@ -81,6 +85,7 @@ class FittedLevelBuilder:
     root_splats: int = 1 << 12
     whole_splats: int = 2_000_000
     fitted_splats: int = 40_000_000
+    fits: bool = True
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
 
@@ -89,71 +94,89 @@ class FittedLevelBuilder:
         if self.nodes is not None:
             return {"splats": "of the source"}
         size = {"root_splats": self.root_splats} if self.count is None else {"count": self.count}
-        made = "fitted" if count <= max(self.whole_splats, self.fitted_splats) else "merged"
+        made = "fitted" if self._is_fitted(count) else "merged"
         return {"splats": made, "leaf_splats": self.leaf_splats, **size}
 
     def seconds(self, count: int) -> float:
         """Return the approximate time for the levels of a scene of `count` splats, by one process."""
-        if count <= self.whole_splats:
-            return count * _SECONDS_WHOLE
-        return count * (_SECONDS_FITTED if count <= self.fitted_splats else _SECONDS_MERGED)
+        fitted = _SECONDS_WHOLE if count <= self.whole_splats else _SECONDS_FITTED
+        return count * (fitted if self._is_fitted(count) else _SECONDS_MERGED)
+
+    def _is_fitted(self, count: int) -> bool:
+        """Return True if the levels of a scene of `count` splats, or of its buckets, are fitted to renders."""
+        return self.fits and count <= max(self.whole_splats, self.fitted_splats)
 
     def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
         progress = PlannedProgress("levels", self._plan(plan.model), plan.context.progress)
         plan = replace(plan, context=replace(plan.context, progress=progress))
-        nodes = self.build(plan.model, plan.context) if self.nodes is None else self.nodes
+        if codebooks is None:
+            plan, codebooks = plan.choose_sh_coding()
+        coding = LevelCoding(plan, codebooks)
+        nodes = self.build(coding.scene, plan.context, coding) if self.nodes is None else self.nodes
         return self.measure(encode_levels(plan, nodes, codebooks), plan.context)
 
-    def build(self, model: SplatModel, context: Context = DEFAULT_CONTEXT) -> list[LevelNode]:
+    def build(
+        self, model: SplatModel, context: Context = DEFAULT_CONTEXT, coding: LevelCoding | None = None
+    ) -> list[LevelNode]:
         """Build the nodes of a scene. Their errors are 0 until `measure` is called.
 
         Args:
             model: the scene.
             context: threads and progress.
+            coding: how the file codes levels.
         """
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
             from csplat_tools.level_fitting import LevelFitter
 
+            scene = _plain(model)
+            fit = LevelFitter(scene, coding=coding, context=context).fit if self.fits else _merge_only
             with thread_count(context.threads):
-                return self._build_leaves(model, LevelFitter(_plain(model), context=context).fit, self.count)
+                return self._build_leaves(scene, fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), len(model), silent)
+            part = self.build_part(model.select(rows), len(model), silent, coding)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_renumber(node, len(nodes), rows) for node in part]
             context.progress("building levels", (done + 1) / len(buckets))
-        parents, top = self.build_top(roots, context)
+        parents, top = self.build_top(roots, context, coding)
         for own, parent in zip(numbers, parents, strict=False):
             for number in own:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_renumber(node, len(nodes)) for node in top]
 
-    def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
+    def build_part(
+        self, splats: SplatModel, scene_count: int, context: Context, coding: LevelCoding | None = None
+    ) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
 
         Args:
             splats: the bucket.
             scene_count: number of splats of the scene.
             context: threads and progress.
+            coding: how the file codes levels.
         """
         from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
-        fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, context=context)
-        fit = fitter.fit if scene_count <= self.fitted_splats else _merge_only
+        splats = _plain(splats)
+        fitter = LevelFitter(splats, is_part=True, work=PART_WORK, coding=coding, context=context)
+        fit = fitter.fit if self._is_fitted(scene_count) else _merge_only
         with thread_count(context.threads):
             return self._build_leaves(splats, fit, self._part_levels)
 
-    def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
+    def build_top(
+        self, roots: Iterable[SplatModel], context: Context, coding: LevelCoding | None = None
+    ) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
 
         Args:
             roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
             context: threads and progress.
+            coding: how the file codes levels.
 
         Returns:
             The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
@@ -166,9 +189,9 @@ class FittedLevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        fitter = LevelFitter(scene, is_part=True, context=context)
+        fitter = LevelFitter(scene, is_part=True, coding=coding, context=context)
         with thread_count(context.threads):
-            nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
+            nodes = self._add_levels(nodes, scene, places, fitter.fit if self.fits else _merge_only, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -211,7 +234,7 @@ class FittedLevelBuilder:
         for place, rows in enumerate(groups):
             places[rows] = place
         nodes = [LevelNode(0, None, rows=rows) for rows in groups]
-        return self._add_levels(nodes, _plain(splats), places, fit, last)
+        return self._add_levels(nodes, splats, places, fit, last)
 
     def _add_levels(
         self, nodes: list[LevelNode], splats: SplatModel, places: I64, fit: _Fit, last: int | None
@@ -247,9 +270,10 @@ def choose_levels(count: int, options: EncodeOptions, levels: LevelCount) -> Fit
         InputError: the number of levels is out of range, or the renderer is not installed.
     """
     if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
-        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")
-    builder = FittedLevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
-    if levels is None or not count or (levels == "auto" and count <= builder.root_splats):
+        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, auto or merged")
+    number = levels if isinstance(levels, int) else None
+    builder = FittedLevelBuilder(number, bucket_splats=options.bucket_splats, fits=levels != "merged")
+    if levels is None or not count or (number is None and count <= builder.root_splats):
         return None
     require_renderer()
     return builder
@@ -290,10 +314,10 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
 
 
 def _merge_only(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
-    """Make the splats of a level as `LevelFitter.fit` does, by merging alone."""
+    """Make the splats of a level as `LevelFitter.fit` does, by merging alone, in 0.6 of its time for merging."""
     from csplat_tools.level_merging import merge_neighbours
 
-    return merge_neighbours(finer, nodes, count)
+    return merge_neighbours(finer, nodes, count, _QUICK_NEIGHBOURS)
 
 
 def _plain(model: SplatModel) -> SplatModel:

@@ -19,7 +19,8 @@ from csplat.types import F32, F64, I64
 from csplat_render import kernels
 from csplat_render.neighbours import nearest_neighbours
 
-_NEIGHBOURS = 8  # with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long
+#: Neighbours with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long.
+NEIGHBOURS = 8
 # Fraction of the splats that a pass keeps: three passes leave a quarter. With more passes, clumps of unmerged splats
 # stay; with fewer, bad pairs are merged.
 _KEPT = 0.629
@@ -38,13 +39,16 @@ _VIEWS = (((0, 1), (0, 3, 1)), ((0, 2), (0, 4, 2)), ((1, 2), (1, 5, 2)))  # axes
 _TINY = np.finfo(np.float64).tiny
 
 
-def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, SplatModel]:
+def merge_neighbours(
+    splats: SplatModel, nodes: I64, count: int, neighbours: int = NEIGHBOURS
+) -> tuple[I64, SplatModel]:
     """Merge splats of the same node until `count` splats are left, or one in each node.
 
     Args:
         splats: the splats.
         nodes: [N], the node of each splat.
         count: number of splats to keep, from 1.
+        neighbours: number of nearest neighbours with which a splat may be merged in a pass.
 
     Returns:
         The node of each splat that is left, and the splats, without extra columns. Means, covariances and SH of merged
@@ -53,7 +57,7 @@ def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, S
     splats = replace(splats, extra={}, means_double=None)
     while len(splats) > count:
         kept_count = max(count, math.floor(_KEPT * len(splats)))
-        pairs = _choose_pairs(splats, nodes, len(splats) - kept_count)
+        pairs = _choose_pairs(splats, nodes, len(splats) - kept_count, neighbours)
         if not len(pairs[0]):
             break
         splats = _merge_pairs(splats, pairs)
@@ -63,9 +67,9 @@ def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, S
     return nodes, splats
 
 
-def _choose_pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
+def _choose_pairs(splats: SplatModel, nodes: I64, most: int, neighbours: int) -> I64:
     """Return the rows of disjoint pairs of neighbours in the same node, the cheapest, at most `most`, [2, M]."""
-    edges = _neighbours(splats.means, nodes)
+    edges = _neighbours(splats.means, nodes, neighbours)
     cheapest = np.argsort(_merge_costs(splats, edges), kind="stable")
     partners = np.full(len(splats), -1, np.int64)
     kernels.call("pair_up", edges, cheapest, len(cheapest), most, partners)
@@ -73,8 +77,8 @@ def _choose_pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
     return np.stack([first, partners[first]])
 
 
-def _neighbours(means: F32, nodes: I64) -> I64:
-    """Return each splat with its up to `_NEIGHBOURS` nearest neighbours in the same node, as edges.
+def _neighbours(means: F32, nodes: I64, most: int) -> I64:
+    """Return each splat with its up to `most` nearest neighbours in the same node, as edges.
 
     Args:
         means: [N, 3].
@@ -85,7 +89,7 @@ def _neighbours(means: F32, nodes: I64) -> I64:
     """
     by_node = np.argsort(nodes, kind="stable")
     sizes = np.unique(nodes, return_counts=True)[1]
-    near = nearest_neighbours(means[by_node].astype(np.float64), _NEIGHBOURS, sizes)[0]
+    near = nearest_neighbours(means[by_node].astype(np.float64), most, sizes)[0]
     starts, k = np.nonzero(near >= 0)
     ends, starts = by_node[near[starts, k]], by_node[starts]
     keys = np.sort(np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))  # one integer for both rows

@@ -23,7 +23,7 @@ from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.error_targets import meet_bounds
 from csplat.encoder.fixed_quantisation import DecodedValues, FixedQuantisation, FreeValues, fix_quantisation
 from csplat.encoder.kmeans import cluster
-from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.encoder.levels import LevelCoding, LevelNode, encode_levels
 from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode_tiles
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
@@ -48,6 +48,7 @@ __all__ = [
     "FreeValues",
     "GaussNewtonBlocks",
     "Importance",
+    "LevelCoding",
     "LevelNode",
     "MeansCoding",
     "Origin",

@@ -14,7 +14,7 @@ from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
 from csplat.encoder.container import FileNode, FileTile, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
 from csplat.encoder.pipeline import EncodedTiles, encode_tile, encode_tiles
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, nearest_entries
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats, nearest_entries
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
@@ -45,6 +45,76 @@ class LevelNode:
     error: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class LevelCoding:
+    """The steps and SH codebooks of a scene, with which its coarser levels are coded, too.
+
+    Attributes:
+        plan: the plan of the scene, whose SH coding is chosen.
+        codebooks: codebooks of the file.
+    """
+
+    plan: EncodePlan
+    codebooks: FileCodebooks
+
+    @property
+    def scene(self) -> SplatModel:
+        """The scene with SH from band 1 on as decoded, except that of escaped splats."""
+        plan, model, sh_plan = self.plan, self.plan.model, self.codebooks.sh_plan
+        if sh_plan.book is not None and sh_plan.of_sample:
+            sh_plan = assign_splats(sh_plan, model, plan.parameters, plan.context)
+        book = sh_plan.book
+        if book is None:
+            return model
+        decoded, coded = book.dequantise(plan.parameters), book.index < book.size
+        shN = np.zeros_like(model.shN)
+        shN[:, : decoded.shape[1]] = decoded
+        shN[~coded] = model.shN[~coded]
+        return replace(model, shN=shN)
+
+    def with_coded_sh(self, splats: SplatModel) -> SplatModel:
+        """Return splats above level 0 with bands from 1 on as decoded, if the file has a codebook of them."""
+        book, parameters = self.codebooks.sh_plan.book, self.plan.parameters
+        if book is None:
+            return splats
+        decoded = nearest_entries(book, splats, parameters, self.plan.context).dequantise(parameters)
+        shN = np.zeros_like(splats.shN)
+        shN[:, : decoded.shape[1]] = decoded
+        return replace(splats, shN=shN)
+
+    def encode(self, node: LevelNode) -> list[FileTile]:
+        """Encode the splats of a node above level 0, above level 1 with coarser steps.
+
+        The step of the means doubles from level to level, from level 2 on. At level 1, doubling would cost quality for
+        few bytes.
+
+        Raises:
+            InputError: a value fits no lattice.
+        """
+        assert node.splats is not None
+        check_model("the encoder", node.splats)
+        splats, level, parameters = clip_scales(node.splats), node.level, self.plan.parameters
+        factors = SAME_STEPS if level == 1 else _COARSE_STEPS
+        sh_plan = self._assign(splats)
+        lattice = replace(parameters.lattice, error=None)  # is a bound for the scene
+        tiles = [
+            replace(tile, exponent=tile.exponent + level - 1, factors=factors)
+            for tile in cut_scene(splats, replace(parameters, lattice=lattice))
+        ]  # fmt: skip
+        return [replace(encode_tile(splats, tile, parameters, sh_plan).tile, level=level) for tile in tiles]
+
+    def _assign(self, splats: SplatModel) -> ShCodingPlan:
+        """Return the SH coding of coarse splats, without escapes.
+
+        Large splats would often be escaped, which takes many bytes for hardly any quality.
+        """
+        plan, sh_plan = self.plan, self.codebooks.sh_plan
+        if sh_plan.book is None:
+            return replace(sh_plan, of_sample=True, extras=())  # for the weights
+        book = nearest_entries(sh_plan.book, splats, plan.parameters, plan.context)
+        return replace(sh_plan, weights=None, book=book, extras=(), of_sample=False)
+
+
 class LevelBuilder(Protocol):
     """A builder of levels of detail, which also measures their errors; picklable."""
 
@@ -65,16 +135,21 @@ class LevelBuilder(Protocol):
         """Encode a planned scene with its levels, in memory; arguments as for `encode_levels`."""
         ...
 
-    def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
+    def build_part(
+        self, splats: SplatModel, scene_count: int, context: Context, coding: LevelCoding | None = None
+    ) -> list[LevelNode]:
         """Build the nodes of a bucket of a scene of `scene_count` splats."""
         ...
 
-    def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
+    def build_top(
+        self, roots: Iterable[SplatModel], context: Context, coding: LevelCoding | None = None
+    ) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
 
         Args:
             roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
             context: threads and progress.
+            coding: how the file codes levels.
 
         Returns:
             The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
@@ -115,39 +190,12 @@ def encode_levels(
     encoded = encode_tiles(plan, codebooks)
     parts = iter(encoded.tiles)
     tiles_by_node = {number: [next(parts).tile for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
-    coarse = [number for number, node in enumerate(nodes) if node.level]
+    coarse, coding = [number for number, node in enumerate(nodes) if node.level], LevelCoding(plan, codebooks)
     for done, number in enumerate(coarse):
-        tiles_by_node[number] = encode_coarse(nodes[number], plan, codebooks)
+        tiles_by_node[number] = coding.encode(nodes[number])
         plan.context.progress("levels", (done + 1) / len(coarse))
     tree = [FileNode(node.parent, tiles_by_node[number], node.error) for number, node in enumerate(nodes)]
     return replace(encoded, nodes=order_nodes(tree))
-
-
-def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -> list[FileTile]:
-    """Encode the splats of a node above level 0 with the SH codebooks of the scene, above level 1 with coarser steps.
-
-    The step of the means doubles from level to level, from level 2 on. At level 1, doubling would cost quality for few
-    bytes.
-
-    Args:
-        node: the node.
-        plan: the plan of the scene, whose SH coding is chosen.
-        codebooks: codebooks of the file.
-
-    Raises:
-        InputError: a value fits no lattice.
-    """
-    assert node.splats is not None
-    check_model("the encoder", node.splats)
-    splats, level = clip_scales(node.splats), node.level
-    factors = SAME_STEPS if level == 1 else _COARSE_STEPS
-    sh_plan = _assign_coarse(splats, plan, codebooks)
-    lattice = replace(plan.parameters.lattice, error=None)  # is a bound for the scene
-    tiles = [
-        replace(tile, exponent=tile.exponent + level - 1, factors=factors)
-        for tile in cut_scene(splats, replace(plan.parameters, lattice=lattice))
-    ]  # fmt: skip
-    return [replace(encode_tile(splats, tile, plan.parameters, sh_plan).tile, level=level) for tile in tiles]
 
 
 def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
@@ -158,15 +206,3 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
     for node in nodes:
         if node.parent is not None and not nodes[node.parent].level > node.level:
             raise InputError(f"the parent of a node of level {node.level} has level {nodes[node.parent].level}")
-
-
-def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
-    """Return the SH coding of coarse splats, without escapes.
-
-    Large splats would often be escaped, which takes many bytes for hardly any quality.
-    """
-    sh_plan = codebooks.sh_plan
-    if sh_plan.book is None:
-        return replace(sh_plan, of_sample=True, extras=())  # for the weights
-    book = nearest_entries(sh_plan.book, splats, plan.parameters, plan.context)
-    return replace(sh_plan, weights=None, book=book, extras=(), of_sample=False)

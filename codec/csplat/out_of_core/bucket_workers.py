@@ -23,7 +23,7 @@ from csplat.disk_files import atomic_writer
 from csplat.encoder.container import FileNode, FileTile, LazyPayload, chunk_crc
 from csplat.encoder.encode_plan import EncodePlan, Origin, clip_scales
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.encoder.levels import LevelBuilder, encode_levels
+from csplat.encoder.levels import LevelBuilder, LevelCoding, encode_levels
 from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tiles
 from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.encoder.tiling import cut_scene
@@ -156,7 +156,8 @@ def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     plan = replace(coding.plan, model=model, origin=Origin(len(model), np.arange(len(model))))
     if coding.levels is None:
         return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), coding.codebooks)
-    nodes = coding.levels.build_part(model, coding.plan.origin.source_count, context)
+    levels = LevelCoding(plan, coding.codebooks)
+    nodes = coding.levels.build_part(levels.scene, coding.plan.origin.source_count, context, levels)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
     return coding.levels.measure(encode_levels(plan, nodes, coding.codebooks), context)

@@ -16,7 +16,7 @@ from csplat.disk_files import atomic_writer
 from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeReport, Origin
 from csplat.encoder.container import FileNode, order_nodes
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.encoder.levels import LevelBuilder, encode_coarse
+from csplat.encoder.levels import LevelBuilder, LevelCoding
 from csplat.encoder.pipeline import EncodedTile
 from csplat.errors import InputError
 from csplat.out_of_core.bucket_workers import (
@@ -258,12 +258,13 @@ def _encode_buckets(
         read_splats(roots_path(store.folder, bucket), plain, sum(nodes[number].splat_count for number in numbers))
         for bucket, numbers in zip(buckets, roots, strict=True)
     )
-    parents, top = levels.build_top(parts, context)
+    coding_of_levels = LevelCoding(plan, codebooks)
+    parents, top = levels.build_top(parts, context, coding_of_levels)
     for numbers, parent in zip(roots, parents, strict=False):  # no parents if no level is above the buckets
         for number in numbers:
             nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
     nodes += [
-        _renumbered(FileNode(node.parent, encode_coarse(node, plan, codebooks)), len(nodes)) for node in top
+        _renumbered(FileNode(node.parent, coding_of_levels.encode(node)), len(nodes)) for node in top
     ]  # fmt: skip
     return levels.measure(replace(encoded, nodes=order_nodes(nodes)), context)
 

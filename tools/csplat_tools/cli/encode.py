@@ -50,7 +50,7 @@ def encode(
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     levels: Annotated[
-        str | None, typer.Option(metavar="LEVELS", help="Levels: auto, or 1 to 16. Default: none.")
+        str | None, typer.Option(metavar="LEVELS", help="auto, merged, or 1 to 16. Default: none.")
     ] = None,
     up: shared.HiddenUp = None,
     attribute_psnr: Annotated[
@@ -98,8 +98,8 @@ def encode(
     far that meets the target. --max-error limits errors of means, covariance,
     opacities, sh0 to sh4. Views are virtual without --data, which requires the
     render extra, or --cameras. --levels adds coarser versions of the scene,
-    which viewers show first: 35 % more bytes, and minutes. --help-all shows
-    --keep, --cameras, --up and all other options.
+    which viewers show first: 35 % more bytes, and minutes; merged takes seconds,
+    and looks worse. --help-all shows --keep, --cameras, --up and all others.
 
     Examples:
       csplat encode scene.ply scene.csplat

@@ -463,11 +463,11 @@ def parse_target(
 
 
 def parse_levels(text: str | None) -> LevelCount:
-    """Parse a number of levels of detail, or `auto`; return `None` for `None`."""
-    if text is None or text == "auto":
-        return None if text is None else "auto"
+    """Parse a number of levels of detail, `auto` or `merged`; return `None` for `None`."""
+    if text is None or text == "auto" or text == "merged":
+        return text  # type: ignore[return-value]  # mypy does not narrow a str by ==
     if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= LEVELS_MAX:
-        raise typer.BadParameter(f"--levels is {text}, expected auto or 1 to {LEVELS_MAX}")
+        raise typer.BadParameter(f"--levels is {text}, expected auto, merged or 1 to {LEVELS_MAX}")
     return int(text)
 
 

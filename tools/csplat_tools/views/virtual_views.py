@@ -83,7 +83,9 @@ def default_views(splats: int) -> tuple[int, tuple[int, int]]:
     return round(VIEW_COUNT / larger), (width, height)
 
 
-def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
+def camera_sequence(
+    model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0, reach: float = 1.0
+) -> list[Camera]:
     """Place virtual cameras around a scene, evenly spread at any count.
 
     Args:
@@ -91,6 +93,7 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
         count: number of cameras.
         size: width and height of the renders, pixels.
         seed: start of the sequence.
+        reach: factor of the largest distance from the centre of a surrounding scene.
 
     Returns:
         `count` cameras, by a low-discrepancy sequence over directions, distances and targets. There are more
@@ -106,7 +109,8 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     if frame.kind == "object":
         around = [_around_object(frame, point, K, size) for point in points]
         return sorted(around, key=lambda camera: not is_clear(frame, cloud, camera))[:count]
-    cameras = [_in_surroundings(frame, number, point, K, size) for number, point in enumerate(points)]
+    distances = _AROUND_DISTANCE[0], reach * _AROUND_DISTANCE[1]
+    cameras = [_in_surroundings(frame, number, point, distances, K, size) for number, point in enumerate(points)]
     details = np.array([detail(cloud, camera, HIDING * frame.extent) for camera in cameras])
     inwards = np.arange(len(cameras)) % _OUTWARDS != 0
     best = np.where(inwards, details[inwards].max(), details[~inwards].max())
@@ -168,8 +172,10 @@ def _around_object(frame: SceneFrame, point: F64, K: F64, size: tuple[int, int])
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
-def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: tuple[int, int]) -> Camera:
-    """Return the camera of a point of `_sequence` inside of surroundings, with arguments as for `_around_object`.
+def _in_surroundings(
+    frame: SceneFrame, number: int, point: F64, distances: tuple[float, float], K: F64, size: tuple[int, int]
+) -> Camera:
+    """Return the camera of a point of `_sequence` inside of surroundings, at distances from the centre in extents.
 
     Every `_OUTWARDS`th by its number looks outwards from near the centre, the others inwards at a place near it.
     """
@@ -179,7 +185,7 @@ def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: t
         eye = frame.centre + frame.extent * offset
         target = eye + along
     else:
-        eye = frame.centre + frame.extent * _interpolate(_AROUND_DISTANCE, point[2]) * along
+        eye = frame.centre + frame.extent * _interpolate(distances, point[2]) * along
         target = frame.centre + frame.extent * offset
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
