@@ -80,7 +80,7 @@ _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the q
 _QUALITIES = (24.0, 80.0)  # range of the precision, PSNR of each attribute alone, dB
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
-_FEW = 3  # most predictions of the count, brief refits, drafts of one coding, files that miss narrowly
+_FEW = 3  # most drafts of one coding, files that miss narrowly, and files with levels of detail
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
@@ -89,7 +89,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
 _SPLAT_SAVING = 4e-8  # fraction of the bytes that another file must save, by splat; 1 % is worth 10 CPU seconds
-_WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
+_WORTH = 0.03  # fraction of the splats, or of the bytes, below which a difference is not worth a candidate
 
 _AMPLE_REMARK = "the target is larger than this scene can use: {} hold all splats at the finest precision"
 _INSIDE_REMARK = (
