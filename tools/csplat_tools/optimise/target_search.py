@@ -231,23 +231,40 @@ class TargetSearch:
 
         Brief refits correct the prediction of the pruning order, and the whole refit corrects theirs.
         """
-        kept_count, turn, costs = self._best_count(pruner), 0, dict[int, float]()
+        kept_count, turn = self._best_count(pruner), 0
+        costs, errors = dict[int, float](), dict[int, float]()  # by number of splats: of drafts, and of pruning
         while True:
-            part, rest_gain = REFITS[turn]
+            part, rest_gain = REFITS[min(turn, len(REFITS) - 1)]
             subset, coding = pruner.refit(kept_count, part), None
             if self.goal.size_bytes is not None or self.goal.images is not None:  # what files of the goal are like
                 coding = self._choose_coding(subset, len(self._first_codings(subset)))
-            previous_count = kept_count
+            count, turn = kept_count, turn + 1
             kept_count = self._best_count(pruner, subset, rest_gain if pruner.refits else 0.0, coding)
             if coding is not None:
-                costs[previous_count] = self._predict(subset, coding)[1]
+                costs[count] = self._predict(subset, coding)[1]
                 cheapest = min(costs, key=costs.__getitem__)
-                kept_count = kept_count if cheapest == previous_count else cheapest
-            is_near = abs(kept_count - previous_count) <= _WORTH * kept_count
+                kept_count = kept_count if cheapest == count else cheapest
+            elif rest_gain < _NEAR:
+                errors[count] = self._unquantised_error(subset, Coding())
+                kept_count = self._between(errors, kept_count)
+            is_near = abs(kept_count - count) <= _WORTH * kept_count
             is_whole = part > 1.0 or len(subset.model) == len(self.whole.model)
-            turn += 1
-            if turn == len(REFITS) or (is_near and is_whole):
+            takes_too_much = errors.get(count, 0.0) > self._most_left_out * self._allowed
+            if (is_near and is_whole) or turn >= len(REFITS) + _FEW * takes_too_much:
                 return subset, self._choose_coding(subset, self._most_codings(subset))
+
+    def _between(self, errors: Mapping[int, float], proposed: int) -> int:
+        """Return a proposed number of splats, between the numbers at which pruning took too much of the error or not.
+
+        Args:
+            errors: mean squared error of pruning by number of kept splats. It rises faster than the pruning order
+                predicts where splats hide each other.
+            proposed: the number.
+        """
+        most = self._most_left_out * self._allowed
+        few = max((count for count, error in errors.items() if error > most), default=0)
+        enough = min((count for count, error in errors.items() if error <= most and count > few), default=0)
+        return round(math.sqrt(few * enough)) if few and enough and not few < proposed < enough else proposed
 
     def _best_count(
         self, pruner: Pruner, refitted: Subset | None = None, rest_gain: float = 0.0, coding: Coding | None = None
