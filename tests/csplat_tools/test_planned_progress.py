@@ -39,7 +39,7 @@ class Run:
 
 def test_the_time_of_a_run_that_follows_its_plan_is_known_from_its_first_stage_on():
     assert 70.0 == planned_cost(PLAN)
-    for seconds in (0.1, 3.0):  # of a unit of cost; machines differ
+    for seconds in (0.1, 3.0):  # per unit of cost, on a fast and on a slow machine
         run = Run()
         run.progress("looking", 0.0)
         assert [0.0] == run.fractions

@@ -23,14 +23,13 @@ from csplat_render.scorer import Scorer, renderer
 from csplat_tools.level_merging import light_of, merge_neighbours
 from csplat_tools.planned_progress import STEP_COST, PlannedWork, view_cost
 from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_outside
-from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
+from csplat_trainer.pruning import ROUND_FRACTION, MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 
 _PIXELS_PER_SPLAT = 8.0  # pixels of a view per splat of level 1; views of each coarser level are half as wide
 #: Pixels, the smallest and largest views of level 1. Larger views take longer, and do not help at its pixel size.
 _WIDTHS = (128, 448)
 _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
-_ROUNDS = 6  # rounds of the order of pruning to a quarter
 #: Factor of the largest distance of views in a surrounding scene, since coarse levels are seen from farther away.
 #: Levels 1 and 2 of garden500k gain 0.7 and 1.2 dB at a distance of 1.3 extents, and lose 0.6 and 0.3 at 0.8.
 _REACH = 1.5
@@ -100,10 +99,11 @@ class LevelFitter:
     def plan(self, finer_count: int, count: int, level: int) -> dict[str, PlannedWork]:
         """Return the expected work on a level by stage, for `PlannedProgress`; arguments as for `fit`."""
         views, width = self._view_count, self._width(level)
+        rounds = math.ceil(math.log(count / finer_count) / math.log(ROUND_FRACTION))
         pixels, middle = 0.75 * width * width, 0.5 * (finer_count + count)
         stages = {
             "measuring splats": PlannedWork(views, view_cost(pixels, finer_count)),
-            "ordering splats": PlannedWork(_ROUNDS, 0.5 * views * view_cost(pixels, middle)),
+            "ordering splats": PlannedWork(rounds, 0.5 * views * view_cost(pixels, middle)),
             "refitting splats": PlannedWork(self._steps(count), STEP_COST * view_cost(pixels, count)),
         }
         return {_named(stage, level): work for stage, work in stages.items()}

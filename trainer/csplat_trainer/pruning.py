@@ -22,7 +22,9 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 
-_ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
+#: Fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB.
+ROUND_FRACTION = 0.72
+
 _UNDRAWN_KEY, _UNSEEN_KEY = -1.0, -0.5  # keys of splats to prune before all others, in this order
 _F16_MAX = float(np.finfo(np.float16).max)
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
@@ -122,7 +124,7 @@ class PruningOrder:
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
         done = 1.0
         while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
-            if not self._prune_round(max(least, int(len(self._left) * _ROUND_FRACTION))):
+            if not self._prune_round(max(least, int(len(self._left) * ROUND_FRACTION))):
                 break
             done = len(self.rows) / len(self.model)
             self.context.progress("ordering splats", done)
@@ -186,5 +188,5 @@ def kept_in_round(opacities: NDArray[np.float32], pruning_error: PruningError, c
         count: number of splats to keep in the last round.
     """
     keys = pruning_keys(opacities, pruning_error, keep_unseen=False)
-    kept_count = max(count, int(len(keys) * _ROUND_FRACTION))
+    kept_count = max(count, int(len(keys) * ROUND_FRACTION))
     return np.sort(np.argsort(keys, kind="stable")[len(keys) - kept_count :])

@@ -110,7 +110,7 @@ class LevelCoding:
         """
         plan, sh_plan = self.plan, self.codebooks.sh_plan
         if sh_plan.book is None:
-            return replace(sh_plan, of_sample=True, extras=())  # for the weights
+            return replace(sh_plan, of_sample=True, extras=())  # each tile gets its own weights
         book = nearest_entries(sh_plan.book, splats, plan.parameters, plan.context)
         return replace(sh_plan, weights=None, book=book, extras=(), of_sample=False)
 

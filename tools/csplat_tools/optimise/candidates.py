@@ -30,7 +30,7 @@ from csplat_render.scorer import Scorer
 if TYPE_CHECKING:
     from csplat_tools.level_builder import FittedLevelBuilder
 
-_FEW_VIEWS = 12  # validation views in which drafts are compared, at least
+_FEW_VIEWS = 12  # least number of validation views in which drafts are compared
 
 #: Stages of progress: a draft, which skips the refit through the quantisers; another file; levels of detail of a file.
 DRAFT, FILE, LEVELS = "encoding a draft", "encoding a file", "building levels"
@@ -228,7 +228,7 @@ class CandidatePool:
     made: list[Candidate] = field(default_factory=list)
     decode: Callable[[bytes], SplatModel] = decode
     renders: int = field(default=0, init=False)
-    _ratio: float = field(default=1.0, init=False)  # of the error in all validation views to the error in some
+    _ratio: float = field(default=1.0, init=False)  # error in all validation views, divided by the error in some
 
     def error(self, model: SplatModel, *, exact: bool) -> float:
         """Return the mean squared error of splats on the validation views, estimated from some unless `exact`."""

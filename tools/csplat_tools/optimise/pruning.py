@@ -38,8 +38,8 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit through the quantisers
-#: Refits that settle the number of splats: steps as a multiple of the usual number, and dB that later ones gain, up to
-#: those of a file. In four scenes, a refit after two brief ones gains 1.1 to 2.4 dB.
+#: Refits that settle the number of splats: steps as a multiple of `_STEPS`, and dB by which the refits that follow are
+#: expected to reduce the error. In four scenes, a refit after two brief ones gains 1.1 to 2.4 dB.
 REFITS = ((0.25, 2.2), (0.25, 1.7), (2.0, 0.1), (0.5, 0.0))
 REFIT_GAIN = 8.0  # dB by which a refit at least reduces the error of pruning
 

@@ -20,6 +20,9 @@ from csplat.types import F64
 #: show 0.02 (donut, no SH) and 0.07 (garden). Files of neighbouring precisions show 0.035 and 0.05.
 BYTES_PER_DB = (0.03, 0.07)
 
+#: Usual bytes per kept splat of a file of a size, without and with SH.
+USUAL_BYTES = (8.0, 11.0)
+
 #: Least fraction of a file's error that is attributed to quantisation, since a smaller rest is noise.
 LEAST_QUANTISED = 0.1
 

@@ -11,10 +11,12 @@ from csplat.model import SplatModel
 from csplat_render import Camera
 from csplat_tools.optimise.candidates import DRAFT, FILE, LEVELS
 from csplat_tools.optimise.pruning import Pruner
+from csplat_tools.optimise.rate_distortion import USUAL_BYTES
 from csplat_tools.optimise.scene_sensitivity import importance_views
 from csplat_tools.planned_progress import STEP_COST, Plan, PlannedWork, planned_cost, view_cost
 from csplat_tools.views import HELD_OUT_COUNT, ViewSet
 from csplat_tools.views.view_sets import render_seconds
+from csplat_trainer.pruning import ROUND_FRACTION
 
 #: Stage of scoring the result on test views.
 SCORES = "scoring the result"
@@ -24,14 +26,12 @@ SCORES = "scoring the result"
 _RENDER, _FILE_STEP, _SENSITIVITY, _DRAFT, _FILE, _SCORES = 1.25, 1.7, 3.7, 100.0, 130.0, 170.0
 _LEVELS = 16_000.0  # cost of levels of detail for each splat, in the unit of plans
 
-# Usual numbers in these searches; pairs are without and with SH.
-_FILES = (3.0, 3.0)
-_DRAFTS, _DRAFTS_OF_SIZE = (3.0, 9.0), (3.0, 16.0)
+# Usual numbers in searches; pairs are without and with SH.
+# `_FILES` and `_DRAFTS` are means of eleven searches for 38 dB, the others are of those above.
+_FILES, _DRAFTS, _DRAFTS_OF_SIZE = (3.0, 2.6), (1.7, 8.4), (3.0, 16.0)
 _FILES_OF_ALL = (3.5, 9.0)  # without pruning
 _LEVELLED = (1.0, 2.0)  # files with levels of detail, for a fraction of the splats and for other targets
-_KEPT_BY_ROUND = 0.72  # fraction of the splats that a round of the pruning order keeps
 _ORDERED_BEYOND = 0.25  # fraction of the kept splats down to which splats are ordered, unless their number is given
-_BYTES_PER_SPLAT = 10.0  # of a file of a size
 _KEPT_PER_DB, _NONE_KEPT = 0.025, 24.0  # fraction of the splats that is kept per dB of PSNR, above this PSNR, dB
 _LEAST_KEPT, _KEPT_OF_IMAGES = 0.1, 0.4  # least of these fractions, and the fraction for a drop of PSNR
 
@@ -114,8 +114,8 @@ def _measuring(pruner: Pruner, target: Target) -> dict[str, PlannedWork]:
     left = _kept_count(pruner.source, target) / max(1, count)
     if target.keep is None and target.size is None:
         left *= _ORDERED_BEYOND
-    rounds = max(1.0, math.log(left) / math.log(_KEPT_BY_ROUND))
-    measured = count * (1.0 - left) / (1.0 - _KEPT_BY_ROUND) / rounds * _KEPT_BY_ROUND  # mean number of splats
+    rounds = max(1.0, math.log(left) / math.log(ROUND_FRACTION))
+    measured = count * (1.0 - left) / (1.0 - ROUND_FRACTION) / rounds * ROUND_FRACTION  # mean number of splats
     return {
         "measuring splats": PlannedWork(HELD_OUT_COUNT + factor * used, view_cost(pixels, count)),
         "ordering splats": PlannedWork(rounds, 0.5 * used * view_cost(pixels, measured)),
@@ -134,6 +134,6 @@ def _kept_count(source: SplatModel, target: Target) -> int:
     if target.keep is not None:
         return target.count(splats)
     if target.size_bytes is not None:
-        return max(1, min(round(target.size_bytes / _BYTES_PER_SPLAT), splats))
+        return max(1, min(round(target.size_bytes / USUAL_BYTES[source.sh_degree > 0]), splats))
     kept = _KEPT_OF_IMAGES if target.psnr is None else _KEPT_PER_DB * (target.psnr - _NONE_KEPT)
     return max(1, round(min(max(kept, _LEAST_KEPT), 1.0) * splats))

@@ -29,7 +29,7 @@ from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
 _TRIES = 4  # largest number of refits that correct the number of splats for a PSNR
-_NOT_PRUNED = "none of some pruned scenes reached the target: all splats are kept, unchanged"
+_NOT_PRUNED = "no pruned scene reached the target: all splats are kept, unchanged"
 
 
 @dataclass(frozen=True)

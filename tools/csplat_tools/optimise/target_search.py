@@ -53,6 +53,7 @@ from csplat_tools.optimise.rate_distortion import (
     LOG_ERROR_PER_DB,
     MOST_LEFT_OUT,
     NOTHING,
+    USUAL_BYTES,
     RateLine,
     RatePoint,
     error_of_psnr,
@@ -67,12 +68,11 @@ from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 
-# Typical values; pairs are without and with SH.
+# Typical values.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
-_USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 # Log bytes per doubling of the codebook by which files are larger than drafts promise, since their refits gain less:
-# 0.1 dB and 0.5 % of the bytes in 18 searches of five scenes.
+# 0.1 dB and 0.5 % of the bytes in 25 searches of five scenes.
 _OCTAVE_COST = 0.012
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 
@@ -287,7 +287,7 @@ class TargetSearch:
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
         elif refitted is None or coding is None:
-            return self._rounded(min(size_bytes / _USUAL_BYTES[self.whole.model.sh_degree > 0], len(self.whole.model)))
+            return self._rounded(min(size_bytes / USUAL_BYTES[self.whole.model.sh_degree > 0], len(self.whole.model)))
         else:
             line = self._rate_line(refitted, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
