@@ -390,7 +390,8 @@ def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merg
     header = read_header(csplat.encode(model.select(slice(0, 0)), levels=FittedLevelBuilder()))
     assert (0, ()) == (header.splat_count, header.all_tiles)
     builder = FittedLevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
-    fitted, merged = (builder.build_part(model, count, Context(threads=1))[1].splats for count in (5000, 5001))
+    parts = [builder.of_scene(model, count).build_part(model, Context(threads=1)) for count in (5000, 5001)]
+    fitted, merged = (nodes[1].splats for nodes in parts)
     assert (True, False) == tuple(same(quarter(model, 4), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
 
@@ -401,7 +402,7 @@ def test_merged_levels_are_merged_alone_in_scenes_of_any_size(model):
     assert ("fitted", "merged") == tuple(builder.settings(SPLATS)["splats"] for builder in (fitted, merged))
     assert merged.seconds(SPLATS) < fitted.seconds(SPLATS)
     level = quarter(model, 4)
-    for parts in (merged.build(model), merged.build_part(model, SPLATS, Context(threads=1))):
+    for parts in (merged.build(model), merged.of_scene(model, SPLATS).build_part(model, Context(threads=1))):
         assert same(level, parts[1].splats)
     (top,) = merged.build_top([level], Context(threads=1))[1]
     assert same(quarter(level, 4), top.splats)

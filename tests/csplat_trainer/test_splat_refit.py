@@ -6,6 +6,7 @@ import captures
 import numpy as np
 import pytest
 
+from csplat.scene import join_blocks
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import renderer
 from csplat_tools.views import camera_sequence
@@ -47,6 +48,22 @@ def test_centres_move_back_if_a_refit_moves_them(source):
     still, adapted = (np.square(np.subtract(render_all(model, cameras), wanted)).mean() for model in (fixed, moved))
     assert adapted < 0.7 * still
     assert (np.abs(moved.means - shifted.means) <= 30 * sizes).all()
+
+
+def test_surroundings_are_shown_and_not_changed(source):
+    cameras = camera_sequence(source, 8, (48, 36))
+    half, around = (source.select(np.arange(first, len(source), 2)) for first in (0, 1))
+    half = replace(half, sh0=half.sh0 + np.float32(0.3))
+    wanted = render_all(source, cameras)
+    adjusted = refit_splats(half, cameras, wanted, steps=64, surroundings=around, moves=True)
+    assert len(half) == len(adjusted)
+    errors = [
+        np.square(np.subtract(render_all(join_blocks(part, [part, around]), cameras), wanted)).mean()
+        for part in (half, adjusted)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    alone = refit_splats(half, cameras, wanted, steps=64, moves=True)
+    assert not np.array_equal(alone.sh0, adjusted.sh0)
 
 
 def test_alphas_of_a_refit_stay_within_0_and_1(source):

@@ -32,8 +32,12 @@ class EveryFourth:
     def seconds(self, count):
         return 1e-5 * count
 
-    def build_part(self, splats, scene_count, context, coding):  # noqa: ARG002 - of the protocol
-        assert (COUNT, 1) == (scene_count, context.threads)
+    def of_scene(self, sample, count):
+        assert 0 < len(sample) <= count == COUNT
+        return self
+
+    def build_part(self, splats, context, coding):  # noqa: ARG002 - of the protocol
+        assert context.threads == 1
         coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
         return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
 

@@ -4,14 +4,14 @@ Space is cut by medians into leaves of equal numbers of splats. Four nodes have 
 leaves have in common, a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the
 next finer level: the splats that matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by
 bucket from merged neighbours, until each bucket is one node. These nodes together are the scene whose levels are built
-next. If a scene has levels already, in streamed SOG, these are taken instead.
+next, as those of a small scene. If a scene has levels already, in streamed SOG, these are taken instead.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +30,7 @@ from csplat.encoder import (
     LevelNode,
     bucket_rows,
     encode_levels,
+    sample_rows,
 )
 from csplat.errors import InputError
 from csplat.formats.sog.sog_reader import read_leaf_numbers
@@ -46,9 +47,9 @@ _KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
 # Seconds per splat to build levels and measure their errors, of SH degree 3: scenes in one piece on two threads, and
 # buckets on one thread.
-_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 1e-4, 3.5e-5, 1.8e-5
+_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 1e-4, 7e-5, 1.8e-5
 # Costs of each report for a splat, in the unit of plans: of buckets, and of coding and measuring levels.
-_BUILDING_COST, _CODING_COST = 4000.0, 100.0
+_BUILDING_COST, _CODING_COST = 8000.0, 100.0
 _QUICK_NEIGHBOURS = 4  # without a fit; 8 gain 0 to 0.4 dB at level 1 (lego60k, garden500k)
 _ROUNDING = 1e-9  # more than the rounding error of a logarithm, so that an exact power needs no further level
 
@@ -73,11 +74,12 @@ class FittedLevelBuilder:
         root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
         whole_splats: number of splats up to which a scene is built in one piece, with more work and a better level 1.
         fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
-            scenes, neighbours are only merged. On two cores, 100 million splats would take 75 to 90 minutes with the
-            fit, and 40 million take 30 to 35.
+            scenes, neighbours are only merged. On two cores, 10 million splats of SH degree 3 take 9 minutes with the
+            fit, so that 40 million would take about 40.
         fits: levels are fitted to renders; otherwise, neighbours are only merged in scenes of any size.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
+        thinned: splats that stand for the scene of the buckets, if their levels are fitted.
     """
 
     count: int | None = None
@@ -88,6 +90,7 @@ class FittedLevelBuilder:
     fits: bool = True
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
+    thinned: SplatModel | None = field(default=None, compare=False, repr=False)
 
     def settings(self, count: int) -> dict[str, Any]:
         """Return what the OPTS chunk of a scene of `count` splats states."""
@@ -137,8 +140,9 @@ class FittedLevelBuilder:
                 return self._build_leaves(scene, fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
+        builder = self.of_scene(model.select(sample_rows(len(model), self.bucket_splats)), len(model))
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), len(model), silent, coding)
+            part = builder.build_part(model.select(rows), silent, coding)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_renumber(node, len(nodes), rows) for node in part]
@@ -149,22 +153,27 @@ class FittedLevelBuilder:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_renumber(node, len(nodes)) for node in top]
 
-    def build_part(
-        self, splats: SplatModel, scene_count: int, context: Context, coding: LevelCoding | None = None
-    ) -> list[LevelNode]:
+    def of_scene(self, sample: SplatModel, count: int) -> FittedLevelBuilder:
+        """Return the builder for the buckets of a scene of `count` splats, of which the sample was evenly drawn."""
+        from csplat_tools.level_fitting import thin_out
+
+        return replace(self, thinned=thin_out(sample, count) if self._is_fitted(count) else None)
+
+    def build_part(self, splats: SplatModel, context: Context, coding: LevelCoding | None = None) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
 
         Args:
             splats: the bucket.
-            scene_count: number of splats of the scene.
             context: threads and progress.
             coding: how the file codes levels.
         """
-        from csplat_tools.level_fitting import PART_WORK, LevelFitter
+        from csplat_tools.level_fitting import PART_WORK, LevelFitter, surroundings_of
 
         splats = _plain(splats)
-        fitter = LevelFitter(splats, is_part=True, work=PART_WORK, coding=coding, context=context)
-        fit = fitter.fit if self._is_fitted(scene_count) else _merge_only
+        fit: _Fit = _merge_only
+        if self.thinned is not None:
+            around = surroundings_of(splats, self.thinned)
+            fit = LevelFitter(splats, around, work=PART_WORK, coding=coding, context=context).fit
         with thread_count(context.threads):
             return self._build_leaves(splats, fit, self._part_levels)
 
@@ -189,7 +198,7 @@ class FittedLevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        fitter = LevelFitter(scene, is_part=True, coding=coding, context=context)
+        fitter = LevelFitter(scene, coding=coding, context=context)
         with thread_count(context.threads):
             nodes = self._add_levels(nodes, scene, places, fitter.fit if self.fits else _merge_only, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]

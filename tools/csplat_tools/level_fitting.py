@@ -1,8 +1,8 @@
 """Fit the splats of a level of detail: keep splats that matter in renders, and refit them to renders of the scene.
 
 Views around the scene become smaller from level to level, so that a level is as good as it can be at the pixel size at
-which it is shown. Parts of a larger scene are seen from outside, as their coarse versions will be, and their splats are
-merged. Work is bounded.
+which it is shown. In a part of a larger scene, splats are merged instead, and refitted between splats that stand for
+the others. Work is bounded.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import LevelCoding
 from csplat.errors import LimitError
 from csplat.model import SplatModel
+from csplat.scene import join_blocks
 from csplat.types import F16, I64, null_progress
 from csplat_render.camera import Camera, resized
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.level_merging import light_of, merge_neighbours
 from csplat_tools.planned_progress import STEP_COST, PlannedWork, view_cost
-from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_outside
+from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_on_part
 from csplat_trainer.pruning import ROUND_FRACTION, MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 
@@ -33,6 +34,7 @@ _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
 #: Factor of the largest distance of views in a surrounding scene, since coarse levels are seen from farther away.
 #: Levels 1 and 2 of garden500k gain 0.7 and 1.2 dB at a distance of 1.3 extents, and lose 0.6 and 0.3 at 0.8.
 _REACH = 1.5
+_SURROUNDINGS = 1 << 15  # largest number of splats that stand for a scene
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
 
@@ -55,8 +57,8 @@ class Work:
 
 #: Work on the levels of a whole scene: 125 CPU s for a million splats. With half of it, level 1 is clearly worse.
 SCENE_WORK = Work(8e7, (40, 160), 1.2e8, (100, 1600))
-#: Work on the levels of a bucket, less than on a scene. More views hardly help; coarser levels need more steps.
-PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))
+#: Work on the levels of a bucket, less than on a scene.
+PART_WORK = Work(0.0, (80, 80), 3.2e7, (100, 400))
 
 
 @dataclass(frozen=True)
@@ -65,16 +67,16 @@ class LevelFitter:
 
     Attributes:
         scene: a scene or a part of a scene, in whose renders levels are measured.
-        is_part: it is a part or a coarse version of a larger scene: views are from outside, and neighbours are merged.
-            Choosing splats would leave holes where no view sees anything. Views as of whole scenes suit some scenes,
-            and make the levels of others worse.
+        surroundings: splats that stand for the others, if the scene is a part of a larger one. Views are those of the
+            larger scene, turned to the part, and neighbours are merged: choosing splats would take several times as
+            many views.
         work: how much is done.
         coding: how the file codes levels; splats are fitted around the SH that the file will have. `None`: unknown.
         context: threads and progress.
     """
 
     scene: SplatModel
-    is_part: bool = False
+    surroundings: SplatModel | None = None
     work: Work = SCENE_WORK
     coding: LevelCoding | None = None
     context: Context = DEFAULT_CONTEXT
@@ -119,19 +121,28 @@ class LevelFitter:
         cameras = [resized(camera, width, width * 3 // 4) for camera in self._cameras]
         held_out, used = cameras[: -self._view_count], cameras[-self._view_count :]
         renders: list[F16] = []
-        if self.is_part:
+        if self.surroundings is not None:
             nodes, chosen = merge_neighbours(finer, nodes, count)
         else:
             rows, renders = self._choose_rows(finer, nodes, count, used, context)
             nodes, chosen = nodes[rows], finer.select(rows)
         if self.coding is not None:
             chosen = self.coding.with_coded_sh(chosen)
-        if self.is_part or level > 1:
-            draw = renderer(self.scene, (0.0, 0.0, 0.0), context=self.context)
+        if not renders or level > 1:
+            draw = renderer(self._shown(self.scene), (0.0, 0.0, 0.0), context=self.context)
             renders = [draw(camera).rgb.astype(np.float16) for camera in used]
-        fitted = refit_splats(chosen, used, renders, steps=self._steps(len(chosen)), moves=True, context=context)
-        scorer = Scorer.of_source(self.scene, held_out, context=replace(self.context, progress=null_progress))
-        return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
+        fitted = refit_splats(
+            chosen, used, renders, steps=self._steps(len(chosen)), surroundings=self.surroundings, moves=True,
+            context=context,
+        )  # fmt: skip
+        quiet = replace(self.context, progress=null_progress)
+        scorer = Scorer.of_source(self._shown(self.scene), held_out, context=quiet)
+        before, after = (scorer.psnr(self._shown(splats)) for splats in (chosen, fitted))
+        return nodes, fitted if after >= before else chosen
+
+    def _shown(self, splats: SplatModel) -> SplatModel:
+        """Return splats of the part with those around it, which views show, too."""
+        return splats if self.surroundings is None else join_blocks(splats, [splats, self.surroundings])
 
     @property
     def _view_count(self) -> int:
@@ -152,8 +163,8 @@ class LevelFitter:
         """The views of level 1: `HELD_OUT_COUNT` or fewer held-out views, then those to fit to."""
         width = self._width(1)
         count, size = self._view_count + min(self._view_count // _CHECKS_EVERY, HELD_OUT_COUNT), (width, width * 3 // 4)
-        if self.is_part:
-            return cameras_outside(self.scene, count, size)
+        if self.surroundings is not None:
+            return cameras_on_part(self._shown(self.scene), self.scene, count, size, reach=_REACH)
         return camera_sequence(self.scene, count, size, reach=_REACH)
 
     @staticmethod
@@ -189,6 +200,33 @@ class LevelFitter:
         by_node = np.lexsort((light, nodes))
         brightest = by_node[np.flatnonzero(np.diff(nodes[by_node], append=-1))]  # the last of each node
         return np.union1d(rows, brightest[~np.isin(nodes[brightest], nodes[rows])]), renders
+
+
+def thin_out(sample: SplatModel, scene_count: int) -> SplatModel:
+    """Return few splats that stand for a scene, without SH, to render a part of it between them.
+
+    They are drawn in proportion to opacity times area, and the smaller ones are enlarged to cover as much as the scene.
+
+    Args:
+        sample: evenly drawn splats of the scene.
+        scene_count: number of splats of the scene.
+    """
+    light = light_of(sample)
+    least = float(light.sum()) / _SURROUNDINGS  # of a splat that is drawn with certainty
+    drawn = np.cumsum(np.minimum(light / least, 1.0)) + 0.5
+    rows = np.flatnonzero(np.diff(np.floor(drawn), prepend=0.0))
+    growth = np.maximum(least * scene_count / len(sample) / light[rows], 1.0)
+    chosen = sample.select(rows)
+    scales = (chosen.scales + 0.5 * np.log(growth)[:, None]).astype(np.float32)
+    return replace(chosen, scales=scales, shN=chosen.shN[:, :0], extra={}, means_double=None)
+
+
+def surroundings_of(part: SplatModel, thinned: SplatModel) -> SplatModel:
+    """Return the splats of a thinned scene that do not stand for a part of it, with as many SH coefficients."""
+    bits = np.dtype([("", np.uint32)] * 3)  # of the coordinates of a mean
+    own, others = (np.ascontiguousarray(splats.means).view(bits)[:, 0] for splats in (part, thinned))
+    chosen = thinned.select(np.flatnonzero(~np.isin(others, own)))
+    return replace(chosen, shN=np.zeros((len(chosen), *part.shN.shape[1:]), np.float32))
 
 
 def _named(stage: str, level: int) -> str:

@@ -21,6 +21,7 @@ from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.encoder.entropy import morton_codes
 from csplat.model import SplatModel
 from csplat.portable_math import exp
+from csplat.scene import join_blocks
 from csplat.types import F16, F32, I64
 from csplat_render import Camera
 from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
@@ -52,6 +53,7 @@ def refit_splats(
     *,
     steps: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
+    surroundings: SplatModel | None = None,
     moves: bool = False,
     context: Context = DEFAULT_CONTEXT,
 ) -> SplatModel:
@@ -63,6 +65,7 @@ def refit_splats(
         references: [H, W, 3] float32 or float16, the reference image of each view.
         steps: number of steps, one view each.
         background: red, green, blue behind the splats.
+        surroundings: splats around the scene, which are rendered and not changed.
         moves: fit the centres instead of `shN`, whose values codebooks then still have; `means_double` is dropped.
         context: threads, progress, and the seed of the order of the views.
 
@@ -71,11 +74,13 @@ def refit_splats(
     """
     views = _TrainingViews(cameras, references, background, model.metadata.antialiased, context)
     order = _order_in_space(model.means)  # makes a step up to a fifth faster
-    model = model.select(order)
-    refit = _FloatRefit(views, steps, context, model, moves=moves)
+    shown = model.select(order)
+    if surroundings is not None:
+        shown = join_blocks(shown, [shown, surroundings])
+    refit = _FloatRefit(views, steps, context, shown, moves=moves, moved=len(model))
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
-    return refit.applied_to(model).select(np.argsort(order))
+    return refit.applied_to(shown).select(np.argsort(order))
 
 
 def _order_in_space(means: F32) -> I64:
@@ -214,6 +219,7 @@ class _FloatRefit(_Refit):
         views, steps, context: as for `_Refit`.
         model: the scene.
         moves: fit the centres instead of `shN`.
+        moved: number of splats to fit, the first.
     """
 
     def __init__(
@@ -224,9 +230,10 @@ class _FloatRefit(_Refit):
         model: SplatModel,
         *,
         moves: bool,
+        moved: int,
     ) -> None:
         super().__init__(views, steps, context)
-        self._start, self._moves = model, moves
+        self._start, self._moves, self._moved = model, moves, moved
         values = _values_to_fit(model)
         if moves:
             del values["shN"]
@@ -249,7 +256,7 @@ class _FloatRefit(_Refit):
 
     def _make_step(self, view: int, rates: dict[str, float]) -> float:
         sizes = self._sizes if self._moves else None
-        step = self._parameters.next_step({**rates, "means": rates["offsets"]}, mean_sizes=sizes)
+        step = self._parameters.next_step({**rates, "means": rates["offsets"]}, mean_sizes=sizes, moved=self._moved)
         return self._views.refit(self._fitted(), view, step)
 
     def applied_to(self, before: SplatModel) -> SplatModel:

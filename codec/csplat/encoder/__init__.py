@@ -7,7 +7,7 @@ callers that tune all values. `encode_levels` adds levels of detail.
 
 from __future__ import annotations
 
-from csplat.encoder.buckets import bucket_rows
+from csplat.encoder.buckets import bucket_rows, sample_rows
 from csplat.encoder.container import FileNode
 from csplat.encoder.encode_options import (
     BUCKET_SPLATS,
@@ -68,4 +68,5 @@ __all__ = [
     "max_class_count",
     "mean_axes",
     "meet_bounds",
+    "sample_rows",
 ]

@@ -135,10 +135,12 @@ class LevelBuilder(Protocol):
         """Encode a planned scene with its levels, in memory; arguments as for `encode_levels`."""
         ...
 
-    def build_part(
-        self, splats: SplatModel, scene_count: int, context: Context, coding: LevelCoding | None = None
-    ) -> list[LevelNode]:
-        """Build the nodes of a bucket of a scene of `scene_count` splats."""
+    def of_scene(self, sample: SplatModel, count: int) -> LevelBuilder:
+        """Return the builder for the buckets of a scene of `count` splats, of which the sample was evenly drawn."""
+        ...
+
+    def build_part(self, splats: SplatModel, context: Context, coding: LevelCoding | None = None) -> list[LevelNode]:
+        """Build the nodes of a bucket of that scene."""
         ...
 
     def build_top(

@@ -157,7 +157,7 @@ def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     if coding.levels is None:
         return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), coding.codebooks)
     levels = LevelCoding(plan, coding.codebooks)
-    nodes = coding.levels.build_part(levels.scene, coding.plan.origin.source_count, context, levels)
+    nodes = coding.levels.build_part(levels.scene, context, levels)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
     return coding.levels.measure(encode_levels(plan, nodes, coding.codebooks), context)

@@ -228,7 +228,10 @@ def _encode_buckets(
     """
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))
-    plan, codebooks = EncodePlan.of_buckets(store, options, origin, context).choose_sh_coding()
+    plan = EncodePlan.of_buckets(store, options, origin, context)
+    if levels is not None and plan.sample is not None:
+        levels = levels.of_scene(plan.sample.model, count)
+    plan, codebooks = plan.choose_sh_coding()
     uncoded = [bucket for bucket in buckets if not coded_path(store.folder, bucket).exists()]
     uncoded_by_section = Counter(bucket.section for bucket in uncoded)
     for section in set(range(len(store.counts))) - set(uncoded_by_section):

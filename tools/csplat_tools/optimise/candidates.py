@@ -261,21 +261,24 @@ class CandidatePool:
             subset: its splats.
             coding: the coding of their colours.
             quality: PSNR of each attribute alone, dB; `None`: the precision of the options.
-            draft: skip the refit through the quantisers, if the subset has such a refit.
+            draft: skip the refit through the quantisers, if the subset has such a refit, and estimate the error.
         """
-        options, draft = coding.options(self.encoding, len(subset.model), quality), draft and subset.refits
+        options, exact = coding.options(self.encoding, len(subset.model), quality), not draft
+        draft = draft and subset.refits
         for candidate in self.made:
             is_alike = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes
             if is_alike and candidate.options == options and candidate.is_draft == draft:
+                if exact:
+                    self.measure(candidate)
                 return candidate
         report, stage = self.progress or null_progress, DRAFT if draft else FILE
         report(stage, 0.0)
         coded = subset.encode(options, use_classes=coding.use_classes, draft=draft)
         result = coded.write()
-        error = self.error(self.decode(result.data), exact=not draft)
+        error = self.error(self.decode(result.data), exact=exact)
         entries = subset.metadata(psnr_of_mse(error))
         result = result if entries is None else coded.write(entries)
-        self.made.append(Candidate(subset, coding, quality, draft, options, coded, result, error, not draft))
+        self.made.append(Candidate(subset, coding, quality, draft, options, coded, result, error, exact))
         report(stage, 1.0)
         return self.made[-1]
 

@@ -670,6 +670,7 @@ class TargetSearch:
         chosen = self.best_so_far()
         if chosen is None:
             raise InputError(self._unreached_message())
+        self.pool.measure(chosen)
         return chosen
 
     @property

@@ -64,7 +64,6 @@ _AROUND_DISTANCE = (0.35, 1.45)  # the same for surrounding scenes
 _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
 _BODY = (1.0, 99.0)  # percentiles of positions along each axis; cameras outside look at the middle of this box
-_OUTSIDE_DISTANCE = (1.3, 2.5)  # half diagonals of the box
 _OUTWARDS = 5  # every Nth view looks away from the middle of a surrounding scene
 _GOOD_DETAIL = 0.4  # least detail as a fraction of the best view's; views of walls from behind are useless
 _CANDIDATES = 3  # candidates per view
@@ -119,17 +118,29 @@ def camera_sequence(
     return [cameras[i] for i in [*good, *others][:count]]
 
 
-def cameras_outside(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
-    """Place virtual cameras outside of a part of a scene, on all sides; arguments as for `camera_sequence`."""
-    frame, K = scene_frame(model), intrinsics(*size, FIELD_OF_VIEW)
-    low, high = np.percentile(model.means.astype(np.float64), _BODY, axis=0)
-    centre = (low + high) / 2.0
-    radius = float(np.sqrt(np.sum((high - low) ** 2))) / 2.0 or frame.extent
+def cameras_on_part(
+    scene: SplatModel, part: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0, reach: float
+) -> list[Camera]:
+    """Place virtual cameras around a scene, and turn them to a part of it.
+
+    Args:
+        scene: the scene, or a sample of it.
+        part: splats of the scene. A part that is small from a camera fills its view; of a larger part, some place is
+            in the middle of the view.
+        count, size, seed, reach: as for `camera_sequence`.
+    """
+    frame, means = scene_frame(scene), part.means.astype(np.float64)
+    low, high = np.percentile(means, _BODY, axis=0)
+    centre, radius = (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
+    places = means[np.random.default_rng(seed).integers(len(means), size=count)]
     cameras = []
-    for point in _sequence(count, seed):
-        along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(2.0 * point[1] - 1.0)))
-        eye = centre + radius * _interpolate(_OUTSIDE_DISTANCE, point[2]) * along
-        cameras.append(look_at(eye, centre, frame.up, K, *size, frame.near))
+    for camera, place in zip(camera_sequence(scene, count, size, seed=seed, reach=reach), places, strict=True):
+        eye = camera.position
+        sine = radius / max(float(np.linalg.norm(eye - centre)), radius, math.ulp(0.0))
+        angle = 2.0 * math.degrees(math.asin(sine))
+        fills = angle < FIELD_OF_VIEW
+        K = intrinsics(*size, angle if fills else FIELD_OF_VIEW)
+        cameras.append(look_at(eye, centre if fills else place, frame.up, K, *size, frame.near))
     return cameras
 
 
