@@ -7,15 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import change_views, invoke
+from command_line import change_views, hide_renderer, invoke
 from sensitivity_cases import cameras, small_scene
 
+import csplat
+from csplat import Context
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
 from csplat_render.scene_frame import scene_frame
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.encode_file import encode_file
 from csplat_tools.importance_file import encoder_importance
+from csplat_tools.scene_files import load_scene
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
@@ -51,6 +56,22 @@ def test_virtual_views_in_surroundings_give_no_blocks(stored):
     assert encoder_importance(virtual, model).blocks is not None
 
 
+@pytest.mark.slow
+def test_fewer_bands_are_projected_if_the_renderer_is_installed(sample_path, tmp_path, monkeypatch):
+    model, options = read_ply(sample_path).select(slice(0, 900)), EncodeOptions(sh_degree=1, attribute_psnr=60.0)
+    scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
+    projected = encode_file(load_scene(model), str(tmp_path / "projected.csplat"), options).result
+    assert "projected onto the others, for the directions of " in projected.report.notes[-1]
+    cut = csplat.encode(model, options)
+    assert scorer.psnr(csplat.decode(cut)) + 0.5 < scorer.psnr(csplat.decode(projected.data))
+    bounded = encode_file(load_scene(model), str(tmp_path / "bounded.csplat"), options, context=Context(memory=10**9))
+    assert "bands are cut off: " in bounded.result.report.notes[-1]
+    hide_renderer(monkeypatch)
+    without = encode_file(load_scene(model), str(tmp_path / "without.csplat"), options).result
+    assert bool(cut == without.data)
+    assert "are not projected onto the others: this installation" in without.report.notes[-1]
+
+
 def test_a_file_is_written_and_read(stored):
     path, model, found = stored
     read = read_sensitivity(path, model)
@@ -59,9 +80,10 @@ def test_a_file_is_written_and_read(stored):
     for name in GROUPS:
         np.testing.assert_array_equal(getattr(found, name).astype(np.float32), read.groups[name], name)
     importance = read.importance()
-    assert ((30, 36), (30, 21)) == (importance.sh_metric.shape, importance.shape_metric.shape)
-    rows, columns = np.triu_indices(8)
-    np.testing.assert_allclose(1.0, importance.sh_metric[:, rows == columns].mean(axis=1), rtol=1e-3)
+    assert ((30, 45), (30, 21)) == (importance.sh_metric.shape, importance.shape_metric.shape)
+    rows, columns = np.triu_indices(9)
+    above = (rows == columns) & (rows > 0)
+    np.testing.assert_allclose(1.0, importance.sh_metric[:, above].mean(axis=1), rtol=1e-3)
     np.testing.assert_allclose(importance.blocks.means, found.means_squares / 3.0, rtol=1e-5)
     np.testing.assert_allclose(importance.blocks.shapes, found.shape_metric / 3.0, rtol=1e-4, atol=1e-9)
 

@@ -27,6 +27,7 @@ from checked import cloud
 
 from csplat import EncodeOptions, SplatModel
 from csplat.encoder import PRESETS, Target
+from csplat.scene import drop_bands
 from csplat_tools.optimise.candidates import CandidatePool
 from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.search_report import make_report
@@ -273,6 +274,9 @@ class _Splats:
             options=chosen, errors={"means": (largest, 0.5 * largest)}, splat_count=contents.splats
         )
         return SimpleNamespace(write=lambda: SimpleNamespace(data=AnalyticFile(self.scene, contents), report=report))
+
+    def lowered(self, degree):
+        return drop_bands(self.model, degree)
 
     def metadata(self, validation_psnr):  # noqa: ARG002  # not recorded in the file
         return None

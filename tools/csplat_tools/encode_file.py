@@ -60,6 +60,9 @@ def describe_levels(scene: Scene, options: EncodeOptions, context: Context = DEF
     return [f"viewers show a scene of {scene.count:,} splats sooner with levels of detail: --levels auto ({price})"]
 
 
+_CUT = "the dropped SH bands are cut off: projecting them onto the others requires the scene in memory, without bounds"
+
+
 @dataclass(frozen=True)
 class EncodedFile:
     """A written file, with its source.
@@ -165,6 +168,7 @@ def encode_file(
                     builder, whole = _levels_of_source(local, builder, context), True
                 in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
                 scene = read_source(local, overrides, opened=opened, in_memory=in_memory, **reading)
+        drops = target is None and options.kept_degree(scene.sh_degree) < scene.sh_degree
         try:
             if scene.in_memory is None:
                 result = _encode_on_disk(scene, output, options, builder, context)
@@ -175,6 +179,10 @@ def encode_file(
                     scene.in_memory, options, importance, target=target, views=views, prune_unseen=prune_unseen,
                     levels=builder, context=context,
                 )  # fmt: skip
+            elif drops and not context.is_bounded:
+                from csplat_tools.importance_file import encode_fewer_bands
+
+                result = encode_fewer_bands(scene.in_memory, options, levels=builder, context=context)
             else:
                 alone = replace(context, memory=None, workers=None, resume=False)  # it fits
                 result = encode_with_report(
@@ -184,6 +192,8 @@ def encode_file(
             if caught.best is None:
                 raise
             result, interrupt = caught.best, caught
+        if drops and importance is None and (scene.in_memory is None or context.is_bounded):
+            result = replace(result, report=replace(result.report, notes=(*result.report.notes, _CUT)))
         if scene.in_memory is not None:
             write_bytes(output, result.data)
         if source_index is not None:

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from csplat.context import DEFAULT_CONTEXT, Context
-from csplat.encoder import EncodeOptions, Importance, apply_weight_floor, max_class_count
+from csplat.encoder import Importance, apply_weight_floor
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import null_progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.file_streams import open_output
-from csplat_tools.optimise.candidates import Weights
 from csplat_tools.views import Colour, ViewSet, evenly_spaced
 from csplat_tools.views.sufficient_views import find_sufficient_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
@@ -140,17 +139,19 @@ def measure_importance(
     cameras: Sequence[Camera],
     background: Colour,
     *,
+    matrices: bool = False,
     context: Context = DEFAULT_CONTEXT,
 ) -> Importance:
     """Measure the importance for the encoder: SH weights, bounded below by opacity and size, and Gauss–Newton blocks.
 
     Args:
         model, cameras, background, context: as for `measure_views`.
+        matrices: measure the directions in which splats are seen, too, onto which dropped SH bands are projected.
 
     Raises:
         InputError: as for `measure_views`.
     """
-    sensitivity = measure_views(model, cameras, background, matrices=False, magnitudes=False, context=context)
+    sensitivity = measure_views(model, cameras, background, matrices=matrices, magnitudes=False, context=context)
     weights = StoredSensitivity.of(model, sensitivity).importance()
     return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
@@ -163,46 +164,3 @@ def importance_views(views: ViewSet, splats: int) -> Sequence[Camera]:
     """
     count = _VIEWS[views.virtual]
     return evenly_spaced(views.training, count // 2 if splats > MANY_SPLATS else count)
-
-
-def complete_importance(
-    source: SplatModel,
-    views: ViewSet,
-    encoding: EncodeOptions,
-    importance: Weights | None,
-    *,
-    inside: bool,
-    context: Context = DEFAULT_CONTEXT,
-) -> tuple[Importance | None, int]:
-    """Return the caller's importance, completed by measurements.
-
-    Args:
-        source: the scene.
-        views: the views; importance is measured in training views.
-        encoding: the caller's options; some exclude quantisation classes.
-        importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
-        inside: the views are virtual, in a surrounding scene; nothing is measured in such views.
-        context: threads and progress.
-
-    Returns:
-        The importance, `None` if it is unknown or would change nothing; and the number of views used here.
-    """
-    may_classify = max_class_count(len(source), encoding) > 1
-    if isinstance(importance, Importance) and importance.blocks is not None:
-        return (importance if may_classify else None), 0
-    has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
-    is_fast = encoding.preset == "fast" and encoding.max_classes is None
-    if inside or is_fast or not (may_classify or has_sh):
-        return None, 0
-    cameras = importance_views(views, len(source))
-    try:
-        measured = measure_importance(source, cameras, views.background, context=context)
-    except InputError:
-        return None, 0  # no splat is visible
-    if isinstance(importance, Importance):
-        measured = replace(importance, blocks=measured.blocks)
-    elif importance is not None:
-        measured = replace(measured, sh=np.asarray(importance))
-    if not encoding.shape_codebook_size:
-        measured = replace(measured, shape_metric=None)  # frees half of the memory
-    return measured, len(cameras)

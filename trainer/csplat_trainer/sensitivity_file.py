@@ -29,7 +29,7 @@ GROUPS = (
 #: Kinds of views that sensitivities are measured in.
 SOURCES = ("training", "cameras", "virtual")
 
-_FORMAT = "csplat sensitivity 1"
+_FORMAT = "csplat sensitivity 2"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _CHANNELS = 3.0
 _SHAPE = 6.0  # entries of a covariance
@@ -48,8 +48,8 @@ class StoredSensitivity:
         missed_share: fraction of the splats that only held-out views saw; NaN if no views were held out.
         shape_matrices: [N, 21] float32, upper triangles of the Gauss–Newton matrices of the covariance over its trace,
             see `Sensitivity.shape_metric`, scaled to a mean diagonal of 1.
-        matrices: [N, K (K + 1) / 2] float16, upper triangles of the Gauss–Newton matrices of the SH bands 1 to d,
-            scaled likewise; or `None`.
+        matrices: [N, B (B + 1) / 2] float16, upper triangles of the Gauss–Newton matrices of the SH bands 0 to d,
+            scaled to a mean diagonal of 1 above band 0; or `None`.
     """
 
     groups: dict[str, NDArray[np.float32]]
@@ -174,10 +174,10 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
 
 
 def _pack(metric: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Return the upper triangles of the bands above 0, divided by the mean of their diagonals."""
+    """Return the upper triangles, divided by the mean of the diagonals above band 0."""
     rows, columns = np.triu_indices(_matrix_size(metric))
     mean = metric[:, (rows == columns) & (rows > 0)].mean(axis=1, dtype=np.float64)
-    return _over_mean(metric[:, rows > 0], mean).astype(np.float16)
+    return _over_mean(metric, mean).astype(np.float16)
 
 
 def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np.float32]:

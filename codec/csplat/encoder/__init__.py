@@ -29,7 +29,7 @@ from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
 from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.encoder.shape_codebook import mean_axes
-from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
+from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor, project_sh
 from csplat.encoder.target import SearchReport, Target, Views
 
 __all__ = [
@@ -68,5 +68,6 @@ __all__ = [
     "max_class_count",
     "mean_axes",
     "meet_bounds",
+    "project_sh",
     "sample_rows",
 ]

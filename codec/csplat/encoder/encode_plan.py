@@ -32,6 +32,7 @@ from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequanti
 from csplat.encoder.splat_importance import (
     Importance,
     get_blocks,
+    project_sh,
     sh_metric,
     shape_metric,
     shape_weights,
@@ -113,7 +114,8 @@ class EncodePlan:
         Args:
             model: the scene.
             options: default: the preset "balanced".
-            importance: [N] weights >= 0 of the splats, or an `Importance`; default: guessed from opacity and size.
+            importance: [N] weights >= 0 of the splats, or an `Importance`; default: guessed from opacity and size. If
+                it has `sh_metric`, dropped SH bands are projected onto the others, and the colours are refitted.
             origin: the source of the scene; `None`: the scene itself.
             allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
             contrast: contrast of the scene that the model is a sample of; see `contrast_of`.
@@ -131,6 +133,9 @@ class EncodePlan:
         if len(origin.source_index) != len(model):
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
+        degree = options.kept_degree(model.sh_degree)
+        if degree < model.sh_degree and isinstance(importance, Importance) and importance.sh_metric is not None:
+            model, origin = project_sh(model, degree, importance), replace(origin, refitted=True)
         if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
             return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats, context), options, origin, context)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)

@@ -8,7 +8,7 @@ size.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ CLASSED_ATTRIBUTES = {"opacities": 1, "scales": 3, "quats": 3, "means": 3, "sh0"
 _WEIGHT_BLOCK = 1 << 16  # splats per block of scalar temporaries
 _METRIC_BLOCK = 1 << 12  # splats per block of matrices
 _SHAPE_BLOCK = 1 << 14  # splats per block of vectors
-_PLAIN_NORM_SHARE = 0.2  # share of the identity in the SH metric, as other views have other directions
+_PLAIN_NORM_SHARE = 0.3  # share of the identity in the SH metric, as other views have other directions
 _SHAPE = 6  # distinct entries of a covariance
 _TRIANGLE = 21  # distinct entries of a symmetric 6 × 6 matrix
 _FLOOR = 0.5  # minimum of a measured weight, as a fraction of the guessed weight
@@ -48,8 +48,9 @@ class Importance:
     Attributes:
         sh: [N], finite, >= 0, weights of the SH coefficients.
         shape: [N], weights of the covariance divided by its trace; `None`: `sh`.
-        sh_metric: [N, K (K + 1) / 2], Gauss-Newton matrices of the coefficients of bands 1 to d, normalised to a mean
-            diagonal of 1 for visible splats: upper triangles, row by row; `None`: the identity.
+        sh_metric: [N, B (B + 1) / 2], Gauss-Newton matrices of the B = (d + 1)² coefficients of bands 0 to d, which say
+            in what directions a splat is seen. Normalised to a mean diagonal of 1 above band 0 for visible splats:
+            upper triangles, row by row; `None`: the identity.
         shape_metric: [N, 21], the same for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
         blocks: Gauss-Newton blocks in absolute units, required for several quantisation classes.
     """
@@ -212,12 +213,51 @@ def sh_metric(model: SplatModel, weights: F32 | None, importance: Floats | Impor
     """
     if weights is None or not isinstance(importance, Importance) or importance.sh_metric is None:
         return None
-    size = model.shN.shape[1]
+    size = model.shN.shape[1] + 1
     metric = _make_metric("SH matrices", weights, importance.sh_metric, size)
-    rows, columns = np.triu_indices(size)
-    triangles = metric.triangles.astype(np.float32) * np.float32(1.0 - _PLAIN_NORM_SHARE)
-    triangles[:, rows == columns] += np.float32(_PLAIN_NORM_SHARE)
-    return ErrorMetric(weights, triangles)
+    return ErrorMetric(weights, _with_other_views(metric.triangles[:, np.triu_indices(size)[0] > 0]))
+
+
+def project_sh(model: SplatModel, degree: int, importance: Floats | Importance | None) -> SplatModel:
+    """Replace the higher SH bands of a scene by the colours of the lower bands that come closest where splats are seen.
+
+    With the coefficients split into kept and dropped ones, a and b, and the Gauss-Newton matrix M of a splat, the error
+    of a change of a is least for M_aa Δa = M_ab b. Without M, dropping bands is best: they are orthogonal.
+
+    Args:
+        model: the scene.
+        degree: SH degree to keep.
+        importance: with `sh_metric`; without it, the bands are only dropped.
+
+    Returns:
+        The scene, its bands above `degree` 0.
+
+    Raises:
+        InputError: the matrices have the wrong number or size, or are not finite.
+    """
+    kept, size = (degree + 1) ** 2, model.shN.shape[1] + 1
+    sh0, shN = model.sh0.copy(), np.zeros_like(model.shN)
+    shN[:, : kept - 1] = model.shN[:, : kept - 1]
+    if not isinstance(importance, Importance) or importance.sh_metric is None:
+        return replace(model, shN=shN)
+    ones = np.ones(len(model), np.float32)
+    triangles = _with_other_views(_make_metric("SH matrices", ones, importance.sh_metric, size).triangles)
+    for start in range(0, len(model), _METRIC_BLOCK):
+        part = slice(start, start + _METRIC_BLOCK)
+        matrices = _full_matrices(triangles[part])
+        right = matrices[:, :kept, kept:] @ model.shN[part, kept - 1 :]
+        change = np.linalg.solve(matrices[:, :kept, :kept], right).astype(np.float32)
+        sh0[part] += change[:, 0]
+        shN[part, : kept - 1] += change[:, 1:]
+    return replace(model, sh0=sh0, shN=shN)
+
+
+def _with_other_views(triangles: Floats) -> F32:
+    """Return matrices [N, D (D + 1) / 2] to which other views are added, which see splats from all directions."""
+    rows, columns = np.triu_indices(_matrix_size(triangles))
+    mixed = triangles.astype(np.float32) * np.float32(1.0 - _PLAIN_NORM_SHARE)
+    mixed[:, rows == columns] += np.float32(_PLAIN_NORM_SHARE)
+    return mixed
 
 
 def shape_metric(weights: F32, importance: Floats | Importance | None) -> ErrorMetric | None:
@@ -297,12 +337,7 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
 
 def matrix_products(triangles: Floats, points: Floats) -> F64:
     """Return the products M x, [n, D, C], of upper triangles and points [n, D, C]."""
-    size = points.shape[1]
-    upper_i, upper_j = np.triu_indices(size)
-    matrices = np.empty((len(points), size, size))
-    matrices[:, upper_i, upper_j] = triangles
-    matrices[:, upper_j, upper_i] = triangles
-    products: F64 = np.einsum("nij,njc->nic", matrices, points.astype(np.float64))
+    products: F64 = np.einsum("nij,njc->nic", _full_matrices(triangles), points.astype(np.float64))
     return products
 
 
@@ -310,6 +345,16 @@ def doubled_triangles(triangles: Floats) -> F64:
     """Return upper triangles with doubled off-diagonal entries."""
     upper_i, upper_j = np.triu_indices(_matrix_size(triangles))
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
+
+
+def _full_matrices(triangles: Floats) -> F64:
+    """Return the symmetric matrices [n, D, D] of upper triangles [n, D (D + 1) / 2]."""
+    size = _matrix_size(triangles)
+    rows, columns = np.triu_indices(size)
+    matrices = np.empty((len(triangles), size, size))
+    matrices[:, rows, columns] = triangles
+    matrices[:, columns, rows] = triangles
+    return matrices
 
 
 def _make_metric(name: str, weights: F32, values: Floats, size: int) -> ErrorMetric:

@@ -237,7 +237,7 @@ def digests(threads):
     model = csplat.SplatModel(**fields)
     sizes = {"codebook_size": 64, "shape_codebook_size": 150}
     options = EncodeOptions(sh_coding="codebook", tile_splats=800, **sizes)
-    matrices = [scene(n, size)[2].triangles for size in (8, 6)]
+    matrices = [scene(n, size)[2].triangles for size in (9, 6)]
     for importance in (Importance(rng.random(n), rng.random(n), *matrices), None):
         result = encode_with_report(model, options, importance=importance, context=context)
         assert all(result.report.options[name] for name in sizes)

@@ -174,7 +174,7 @@ def test_the_error_of_rounding_is_predicted():
     from captures import cameras, shell
 
     from csplat_render import render
-    from csplat_tools.optimise.scene_sensitivity import measure_importance
+    from csplat_tools.scene_sensitivity import measure_importance
 
     scene, views, options = shell(0), cameras(12), EncodeOptions(attribute_psnr=58)
     importance = measure_importance(scene, views, (0.0, 0.0, 0.0))

@@ -13,6 +13,7 @@ from checked import encoded
 from codebooks_cases import exact, scene
 from quantisation_cases import COUNT, important, unequal
 
+from csplat import InputError, decode_scene, encode
 from csplat.context import DEFAULT_CONTEXT
 from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, Importance
@@ -23,8 +24,10 @@ from csplat.encoder.splat_importance import (
     ErrorMetric,
     GaussNewtonBlocks,
     apply_weight_floor,
+    project_sh,
     rounding_errors,
 )
+from csplat.spherical_harmonics import evaluate_sh
 
 
 def test_errors_agree_with_the_matrices():
@@ -41,6 +44,61 @@ def test_entries_of_points_without_weight_do_not_move():
     silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
     moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, DEFAULT_CONTEXT)
     assert {tuple(row) for row in moved.reshape(len(moved), -1)} <= {tuple(row) for row in entries.reshape(5, -1)}
+
+
+def directions(seed, spread):
+    """Draw 60 unit vectors, around +z if the spread is small."""
+    drawn = np.random.default_rng(seed).standard_normal((60, 3)) * [spread, spread, 1.0]
+    drawn[:, 2] = np.abs(drawn[:, 2]) + (spread < 1.0)
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def colours(model, seen):
+    """Return the colours [N, V, 3] of splats in directions [V, 3]."""
+    coefficients = np.concatenate([model.sh0[:, None], model.shN], axis=1, dtype=np.float64)
+    return np.einsum("vb,nbc->nvc", evaluate_sh(model.sh_degree, seen), coefficients)
+
+
+def seen_from(seen, count):
+    """Return the importance of splats that are seen from directions [V, 3] alone."""
+    basis = evaluate_sh(3, seen)
+    matrix = basis.T @ basis / len(seen)
+    matrix /= np.diagonal(matrix)[1:].mean()
+    return Importance(np.ones(count), sh_metric=np.tile(matrix[np.triu_indices(16)].astype(np.float32), (count, 1)))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_dropped_bands_are_projected_where_splats_are_seen(make_model, degree):
+    model = make_model(200, 3)
+    cap, others = directions(0, 0.3), directions(1, 1.0) * [1.0, 1.0, -1.0]
+    dropped, projected = (project_sh(model, degree, one) for one in (None, seen_from(cap, len(model))))
+    for lowered in (dropped, projected):
+        assert not lowered.shN[:, (degree + 1) ** 2 - 1 :].any()
+    np.testing.assert_array_equal(model.sh0, dropped.sh0)
+    seen, unseen = (
+        [np.square(colours(one, view) - colours(model, view)).mean() for one in (dropped, projected)]
+        for view in (cap, others)
+    )
+    assert seen[1] < 0.35 * seen[0]
+    assert unseen[1] < 4.0 * unseen[0]  # a fifth of the matrix is that of all directions
+    everywhere = Importance(
+        np.ones(200), sh_metric=np.tile(np.eye(16, dtype=np.float32)[np.triu_indices(16)], (200, 1))
+    )
+    np.testing.assert_allclose(dropped.shN, project_sh(model, degree, everywhere).shN, atol=1e-6)
+
+
+def test_files_with_fewer_bands_have_projected_colours_and_declare_no_errors_of_these(make_model):
+    model, options = make_model(300, 3), EncodeOptions(sh_degree=1, attribute_psnr=70.0)
+    importance = seen_from(directions(0, 0.3), len(model))
+    result = encode_with_report(model, options, importance=importance)
+    wanted = project_sh(model, 1, importance).select(result.source_index)
+    scene = decode_scene(result.data)
+    np.testing.assert_allclose(wanted.sh0, scene.model.sh0, atol=0.03)
+    np.testing.assert_allclose(wanted.shN[:, :3], scene.model.shN, atol=0.03)
+    assert scene.declared_bounds.refitted
+    assert result.report.errors.keys().isdisjoint({"sh0", "sh1", "sh2", "sh3"})
+    with pytest.raises(InputError, match=r"SH matrices float32 \[300, 120\], expected floats \[300, 136\]"):
+        encode(model, options, importance=replace(importance, sh_metric=importance.sh_metric[:, :120]))
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 test_target_search.py tests the logic of the search on analytic scenes.
 
-Also: csplat_tools.optimise.candidates, csplat_tools.optimise.pruning, csplat_tools.optimise.scene_sensitivity,
+Also: csplat_tools.optimise.candidates, csplat_tools.optimise.pruning, csplat_tools.scene_sensitivity,
 csplat_tools.optimise.search_report.
 """
 
@@ -31,10 +31,10 @@ from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import parse_max_error
-from csplat_tools.optimise.candidates import CandidatePool, WholeScene
-from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
+from csplat_tools.optimise.candidates import CandidatePool, WholeScene, complete_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.scene_sensitivity import measure_importance
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
@@ -268,7 +268,8 @@ def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
     cases = {
         "SH": (False, scene, plain, None, True, count),
         "small, without SH": (False, bare, plain, None, False, 0),
-        "SH that is left out": (False, scene, EncodeOptions(sh_degree=0), None, False, 0),
+        "SH that is left out": (False, scene, EncodeOptions(sh_degree=0), None, True, count),
+        "SH that is left out, inside": (True, scene, EncodeOptions(sh_degree=0), None, True, count),
         "preset fast": (False, scene, EncodeOptions("fast"), None, False, 0),
         "inside": (True, scene, plain, None, False, 0),
         "curvatures": (False, unequal, plain, measured, True, 0),

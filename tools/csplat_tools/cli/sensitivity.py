@@ -45,7 +45,7 @@ def sensitivity(
     out.check(inputs=(source, *views.inputs), named={"OUT.npz": output})
     check_name(output, ".npz", "sensitivity", source)
     require_renderer()
-    from csplat_tools.optimise.scene_sensitivity import measure_scene
+    from csplat_tools.scene_sensitivity import measure_scene
     from csplat_tools.views.view_sets import total_render_seconds
 
     with out.bar() as progress:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
@@ -21,11 +22,16 @@ from csplat.encoder import (
     PresetName,
     ShCoding,
     encode_tiles,
+    max_class_count,
+    project_sh,
 )
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
+from csplat_tools.scene_sensitivity import importance_views, measure_importance
+from csplat_tools.views import ViewSet
 
 if TYPE_CHECKING:
     from csplat_tools.level_builder import FittedLevelBuilder
@@ -102,6 +108,10 @@ class Subset(Protocol):
         """Quantise and code the splats."""
         ...
 
+    def lowered(self, degree: int) -> SplatModel:
+        """Return the splats with fewer SH bands, as they are encoded."""
+        ...
+
     def metadata(self, validation_psnr: float) -> Mapping[str, Any] | None:
         """Return the entries for the file's options."""
         ...
@@ -131,8 +141,14 @@ class WholeScene:
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""
-        weights = self.measured if use_classes and self.measured is not None else self.importance
+        weights, drops = self.importance, options.kept_degree(self.model.sh_degree) < self.model.sh_degree
+        if self.measured is not None and (use_classes or drops):
+            weights = self.measured if use_classes else replace(self.measured, blocks=None)
         return encode_tiles(EncodePlan.of(self.model, options, importance=weights, context=self.context))
+
+    def lowered(self, degree: int) -> SplatModel:
+        """Return the splats with fewer SH bands."""
+        return project_sh(self.model, degree, self.measured)
 
     def metadata(self, validation_psnr: float) -> None:  # the protocol's
         """Return nothing."""
@@ -310,3 +326,50 @@ class CandidatePool:
             if candidate.subset is subset and candidate.quality is not None and candidate.is_draft == draft
         ]
         return [candidate for candidate in made if candidate.coding.options(self.encoding, splats, None) == options]
+
+
+def complete_importance(
+    source: SplatModel,
+    views: ViewSet,
+    encoding: EncodeOptions,
+    importance: Weights | None,
+    *,
+    inside: bool,
+    context: Context = DEFAULT_CONTEXT,
+) -> tuple[Importance | None, int]:
+    """Return the caller's importance, completed by measurements.
+
+    Args:
+        source: the scene.
+        views: the views; importance is measured in training views.
+        encoding: the caller's options; some exclude quantisation classes.
+        importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
+        inside: the views are virtual, in a surrounding scene; they only say in which directions splats are seen.
+        context: threads and progress.
+
+    Returns:
+        The importance, `None` if it is unknown or would change nothing; and the number of views used here.
+    """
+    may_classify = max_class_count(len(source), encoding) > 1
+    if isinstance(importance, Importance) and importance.blocks is not None:
+        return (importance if may_classify else None), 0
+    has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
+    is_fast = encoding.preset == "fast" and encoding.max_classes is None
+    drops = encoding.kept_degree(source.sh_degree) < source.sh_degree
+    if not drops and (inside or is_fast or not (may_classify or has_sh)):
+        return None, 0
+    cameras = importance_views(views, len(source))
+    try:
+        measured = measure_importance(source, cameras, views.background, matrices=drops, context=context)
+    except InputError:
+        return None, 0  # no splat is visible
+    if inside or is_fast:
+        measured = replace(measured, blocks=None)
+    if isinstance(importance, Importance):
+        directions = measured.sh_metric if importance.sh_metric is None else importance.sh_metric
+        measured = replace(importance, blocks=measured.blocks, sh_metric=directions)
+    elif importance is not None:
+        measured = replace(measured, sh=np.asarray(importance))
+    if not encoding.shape_codebook_size:
+        measured = replace(measured, shape_metric=None)  # frees half of the memory
+    return measured, len(cameras)

@@ -24,6 +24,7 @@ from csplat.encoder import (
     encode_tiles,
     fix_quantisation,
     max_class_count,
+    project_sh,
 )
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -31,7 +32,7 @@ from csplat.types import F16, F32, F64, I64
 from csplat_render import Camera
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
-from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
+from csplat_tools.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import ViewSet, camera_sequence
 from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
 from csplat_trainer.pruning import MeasuredViews, PruningOrder
@@ -248,6 +249,10 @@ class PrunedSubset:
         """Return the splats as they decode from these values, in the order of the file."""
         return replace(self.model, **vars(fixed.dequantise(values)), means_double=None)
 
+    def lowered(self, degree: int) -> SplatModel:
+        """Return the splats with fewer SH bands, as they are encoded."""
+        return project_sh(self.model, degree, self._importance)
+
     def metadata(self, validation_psnr: float) -> Mapping[str, Any]:
         """Return the entries for the file's options: splats of the source, number of views, PSNR of the file."""
         entry = {"splats": len(self.pruner.source), "views": len(self.pruner.cameras)}
@@ -268,7 +273,9 @@ class PrunedSubset:
         pruner = self.pruner
         cameras = importance_views(replace(pruner.views, training=pruner.sufficient.used), len(self.model))
         try:
-            return measure_importance(self.model, cameras, pruner.views.background, context=pruner.context)
+            return measure_importance(
+                self.model, cameras, pruner.views.background, matrices=True, context=pruner.context
+            )
         except InputError:
             return None
 

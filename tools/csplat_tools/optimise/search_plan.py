@@ -12,8 +12,8 @@ from csplat_render import Camera
 from csplat_tools.optimise.candidates import DRAFT, FILE, LEVELS
 from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.rate_distortion import USUAL_BYTES
-from csplat_tools.optimise.scene_sensitivity import importance_views
 from csplat_tools.planned_progress import STEP_COST, Plan, PlannedWork, planned_cost, view_cost
+from csplat_tools.scene_sensitivity import importance_views
 from csplat_tools.views import HELD_OUT_COUNT, ViewSet
 from csplat_tools.views.view_sets import render_seconds
 from csplat_trainer.pruning import ROUND_FRACTION

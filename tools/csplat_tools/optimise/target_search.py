@@ -36,14 +36,21 @@ from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError, SearchInterrupted
 from csplat.goal_search import next_value
 from csplat.model import SplatModel
-from csplat.scene import drop_bands
 from csplat.types import null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.level_builder import FittedLevelBuilder
-from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
+from csplat_tools.optimise.candidates import (
+    Candidate,
+    CandidatePool,
+    Coding,
+    Subset,
+    Weights,
+    WholeScene,
+    complete_importance,
+)
 from csplat_tools.optimise.pruning import REFITS, Pruner
 from csplat_tools.optimise.rate_distortion import (
     AIM,
@@ -61,11 +68,11 @@ from csplat_tools.optimise.rate_distortion import (
     log_bytes_at_size,
     rate_exponent,
 )
-from csplat_tools.optimise.scene_sensitivity import MANY_SPLATS, complete_importance
 from csplat_tools.optimise.search_plan import SCORES, keeps_all, search_plan
 from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.planned_progress import PlannedProgress
+from csplat_tools.scene_sensitivity import MANY_SPLATS
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 
 # Typical values.
@@ -601,8 +608,7 @@ class TargetSearch:
             return 0.0
         key = subset, degree
         if key not in self._errors:
-            with_bands = drop_bands(subset.model, degree)
-            self._errors[key] = self.pool.error(with_bands, exact=exact or not self.pool.renders)
+            self._errors[key] = self.pool.error(subset.lowered(degree), exact=exact or not self.pool.renders)
         return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:

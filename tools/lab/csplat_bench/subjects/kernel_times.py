@@ -35,7 +35,7 @@ from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import renderer
 from csplat_tools.optimise.candidates import Coding
-from csplat_tools.optimise.scene_sensitivity import measure_importance
+from csplat_tools.scene_sensitivity import measure_importance
 from csplat_tools.views import BLACK, camera_sequence
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.initial_splats import measure_extent
