@@ -220,6 +220,8 @@ def _encode_model(
     """
     if target is None:
         return encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
+    if target.max_error and isinstance(importance, Importance):
+        importance = replace(importance, sh_metric=None)  # the errors of projected colours would not be known
     if target.is_rendered:
         search: Search = _plugin("csplat.search", "target", "search for targets")
         return search(model, options, target=target, views=views, importance=importance, levels=levels, context=context)

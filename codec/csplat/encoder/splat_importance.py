@@ -37,6 +37,7 @@ _TRIANGLE = 21  # distinct entries of a symmetric 6 × 6 matrix
 _FLOOR = 0.5  # minimum of a measured weight, as a fraction of the guessed weight
 _COMMON = 0.99  # quantile to which guessed weights are clipped
 _LOG_SIZE_MAX = 80.0  # log sizes are clipped to ± this, so that the weights stay within float32
+_SH_MAX = 1e37  # largest change of a coefficient by a projection
 _UNIFORM = 1.0 / 12.0  # mean squared error of rounding, in squared steps
 _ROOT2 = 2.0**0.5
 
@@ -246,9 +247,10 @@ def project_sh(model: SplatModel, degree: int, importance: Floats | Importance |
         part = slice(start, start + _METRIC_BLOCK)
         matrices = _full_matrices(triangles[part])
         right = matrices[:, :kept, kept:] @ model.shN[part, kept - 1 :]
-        change = np.linalg.solve(matrices[:, :kept, :kept], right).astype(np.float32)
-        sh0[part] += change[:, 0]
-        shN[part, : kept - 1] += change[:, 1:]
+        change = np.linalg.solve(matrices[:, :kept, :kept], right)
+        change[np.abs(change).max(axis=(1, 2)) > _SH_MAX] = 0.0  # would not fit float32
+        sh0[part] += change[:, 0].astype(np.float32)
+        shN[part, : kept - 1] += change[:, 1:].astype(np.float32)
     return replace(model, sh0=sh0, shN=shN)
 
 

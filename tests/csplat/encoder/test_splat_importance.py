@@ -13,7 +13,7 @@ from checked import encoded
 from codebooks_cases import exact, scene
 from quantisation_cases import COUNT, important, unequal
 
-from csplat import InputError, decode_scene, encode
+from csplat import InputError, Target, decode_scene, encode
 from csplat.context import DEFAULT_CONTEXT
 from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, Importance
@@ -81,10 +81,14 @@ def test_dropped_bands_are_projected_where_splats_are_seen(make_model, degree):
     )
     assert seen[1] < 0.35 * seen[0]
     assert unseen[1] < 4.0 * unseen[0]  # a fifth of the matrix is that of all directions
+    model.shN[0], model.shN[1] = 3e38, -1e20
+    extreme = project_sh(model, degree, seen_from(cap, len(model)))
+    assert np.isfinite(extreme.sh0).all()
+    assert np.isfinite(extreme.shN).all()
     everywhere = Importance(
         np.ones(200), sh_metric=np.tile(np.eye(16, dtype=np.float32)[np.triu_indices(16)], (200, 1))
     )
-    np.testing.assert_allclose(dropped.shN, project_sh(model, degree, everywhere).shN, atol=1e-6)
+    np.testing.assert_allclose(dropped.shN[2:], project_sh(model, degree, everywhere).shN[2:], atol=1e-6)
 
 
 def test_files_with_fewer_bands_have_projected_colours_and_declare_no_errors_of_these(make_model):
@@ -97,6 +101,8 @@ def test_files_with_fewer_bands_have_projected_colours_and_declare_no_errors_of_
     np.testing.assert_allclose(wanted.shN[:, :3], scene.model.shN, atol=0.03)
     assert scene.declared_bounds.refitted
     assert result.report.errors.keys().isdisjoint({"sh0", "sh1", "sh2", "sh3"})
+    bounded = encode_with_report(model, options, importance=importance, target=Target(max_error={"sh0": 0.02}))
+    assert 0.0 < bounded.report.search.reached["sh0"] <= 0.02
     with pytest.raises(InputError, match=r"SH matrices float32 \[300, 120\], expected floats \[300, 136\]"):
         encode(model, options, importance=replace(importance, sh_metric=importance.sh_metric[:, :120]))
 

@@ -335,6 +335,7 @@ def complete_importance(
     importance: Weights | None,
     *,
     inside: bool,
+    projects: bool = True,
     context: Context = DEFAULT_CONTEXT,
 ) -> tuple[Importance | None, int]:
     """Return the caller's importance, completed by measurements.
@@ -345,6 +346,7 @@ def complete_importance(
         encoding: the caller's options; some exclude quantisation classes.
         importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
         inside: the views are virtual, in a surrounding scene; they only say in which directions splats are seen.
+        projects: dropped SH bands may be projected onto the others, for these directions.
         context: threads and progress.
 
     Returns:
@@ -355,7 +357,7 @@ def complete_importance(
         return (importance if may_classify else None), 0
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
     is_fast = encoding.preset == "fast" and encoding.max_classes is None
-    drops = encoding.kept_degree(source.sh_degree) < source.sh_degree
+    drops = projects and encoding.kept_degree(source.sh_degree) < source.sh_degree
     if not drops and (inside or is_fast or not (may_classify or has_sh)):
         return None, 0
     cameras = importance_views(views, len(source))

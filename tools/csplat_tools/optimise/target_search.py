@@ -769,7 +769,7 @@ def search_target(
         else:
             if pruner is None:
                 measured, sensitivity_views = complete_importance(
-                    source, views, encoding, importance, inside=inside, context=context
+                    source, views, encoding, importance, inside=inside, projects=not target.max_error, context=context
                 )
                 search.whole = replace(whole, measured=measured)
             chosen = search.best() if levels is None else search.best_with_levels(levels)
