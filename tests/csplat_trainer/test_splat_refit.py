@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from csplat.scene import join_blocks
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.pruning_error import measure_pruning_error
+from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
 from csplat_tools.views import camera_sequence
+from csplat_trainer.parameters import Parameters, from_model
 from csplat_trainer.splat_refit import refit_splats
 
 pytestmark = pytest.mark.usefixtures("small_views")
@@ -48,6 +51,22 @@ def test_centres_move_back_if_a_refit_moves_them(source):
     still, adapted = (np.square(np.subtract(render_all(model, cameras), wanted)).mean() for model in (fixed, moved))
     assert adapted < 0.7 * still
     assert (np.abs(moved.means - shifted.means) <= 30 * sizes).all()
+
+
+@pytest.mark.parametrize("moved", [0, 5, 16, 37, None])
+def test_a_step_moves_the_first_splats_alone(source, moved):
+    (camera,) = camera_sequence(source, 1, (48, 36))
+    parameters = Parameters.starting_at(from_model(source, source.sh_degree))
+    before = {name: array.copy() for name, array in parameters.values.items()}
+    step = parameters.next_step(dict.fromkeys(before, 0.01), moved=moved)
+    splats = UncheckedSplats(**{"opacities" if name == "logits" else name: parameters.values[name] for name in before})
+    Rasteriser().refit(splats, camera, np.ones((36, 48, 3), np.float32), step)
+    changed = np.zeros(len(source), bool)
+    for name, array in parameters.values.items():
+        changed |= (array != before[name]).reshape(len(source), -1).any(axis=1)
+    count = len(source) if moved is None else moved
+    assert not changed[count:].any()
+    assert not count or changed[:count].any()
 
 
 def test_surroundings_are_shown_and_not_changed(source):
