@@ -39,7 +39,8 @@ class EncodeOptions:
         sh0_step: step of the degree-0 colour, > 0.
         sh_step: step of the higher SH bands, > 0.
         chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
-        sh_degree: SH degree to keep, 0 to 4; `None` keeps all bands.
+        sh_degree: SH degree to keep, 0 to 4; `None` keeps all bands. Higher bands are projected onto the others if the
+            importance says in which directions splats are seen (`csplat encode` measures that), and cut off otherwise.
         sh_coding: "auto", "codebook", "scalar" or "none".
         codebook_size: number of entries of the SH codebook.
         escape_fraction: fraction of the splats to escape from the SH codebook, 0 to 1; the splats with the largest
