@@ -1,8 +1,8 @@
 """Encode scenes to `.csplat` files.
 
 `csplat.encode` encodes in one call, with the given options or to a `Target`. `EncodePlan` and `encode_tiles` encode in
-steps, for callers that refit colours to the quantised geometry; `fix_quantisation` is for
-callers that tune all values. `encode_levels` adds levels of detail.
+steps, for callers that measure files; `fix_quantisation` is for callers that tune all values. `encode_levels` adds
+levels of detail.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Plan the encoding of a scene: steps, quantisation classes, tiles and shape codebook, before colours are final.
 
     plan = EncodePlan.of(model, options)
-    plan = plan.with_colours(*fit_colours(plan.scene))  # optional
     encoded = encode_tiles(plan)
     encoded.write({"fitted": {"psnr": measure(encoded.write().data)}})
 
-The encoder has no renderer. A caller with a renderer can fit colours to renders of `EncodePlan.scene`, and record the
-PSNR of the file in the file. A caller that tunes all values uses `fix_quantisation` instead of `encode_tiles`.
+The encoder has no renderer. A caller with a renderer can record the PSNR of the file in the file. A caller that tunes
+the values uses `fix_quantisation` instead of `encode_tiles`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
-from csplat.encoder.buckets import BucketStore, MemoryBuckets, bucket_rows, sample_rows
+from csplat.encoder.buckets import BucketStore, MemoryBuckets, bucket_rows
 from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
@@ -41,7 +40,7 @@ from csplat.encoder.splat_importance import (
 from csplat.encoder.tiling import TileSplats, cut_scene, dequantise_means, dequantise_opacities
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.types import F32, I64
+from csplat.types import I64
 
 _EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
 
@@ -195,21 +194,6 @@ class EncodePlan:
             opacities=dequantise_opacities(model.opacities, tiles, parameters),
             means_double=None,
         )
-
-    def with_colours(self, sh0: F32, shN: F32) -> EncodePlan:
-        """Return the plan with refitted colours.
-
-        Args:
-            sh0: [N, 3] float32.
-            shN: [N, K, 3] float32, of the model's SH degree.
-
-        Raises:
-            InputError: a shape or dtype is wrong, or a value is not finite.
-        """
-        model = replace(self.model, sh0=sh0, shN=shN)
-        rows = None if self.sample is None else sample_rows(len(model), self.options.bucket_splats)
-        sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
-        return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
     def choose_sh_coding(self) -> tuple[EncodePlan, FileCodebooks]:
         """Choose the SH coding; return the complete plan and the codebooks with the assignment of the splats.

@@ -5,11 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from large_cases import COUNT, FAST, WHOLE
+from large_cases import COUNT, WHOLE
 from models import with_facts
 
-from csplat import decode
-from csplat.encoder import buckets, encode_plan, encode_tiles
+from csplat.encoder import buckets
 from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.ply import read_ply
 
@@ -21,15 +20,6 @@ def model(sample_path):
     means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
     extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
     return with_facts(replace(many, means=means, extra=extra), entries={"licence": "CC0"})
-
-
-@pytest.mark.slow
-def test_the_sample_of_a_plan_has_refitted_colours(model):
-    other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
-    assert other.sample is not None
-    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT, WHOLE)], other.sample.model.shN)
-    decoded = decode(encode_tiles(other).write().data)
-    assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
 
 def test_buckets_partition_the_splats_by_place(model):

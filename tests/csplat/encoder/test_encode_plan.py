@@ -37,24 +37,8 @@ def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, option
         assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
 
 
-@pytest.mark.slow
-def test_new_colours_change_only_colours(make_model):
-    model = make_model(260, 2)
-    plan = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
-    fitted = plan.with_colours(model.sh0 + 1, 0 * model.shN)
-    before, after = (decode_scene(encode_tiles(one).write().data) for one in (plan, fitted))
-    for name in GEOMETRY:
-        assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
-    np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
-    assert not after.model.shN.any()
-    assert (False, True) == (before.declared_bounds.refitted, after.declared_bounds.refitted)
-    assert model.sh0 is plan.model.sh0  # the plan is unchanged
-
-
-def test_colours_and_an_origin_of_other_splats_are_refused(make_model):
+def test_an_origin_of_other_splats_is_refused(make_model):
     model = make_model(4, 1)
-    with pytest.raises(InputError):
-        EncodePlan.of(model).with_colours(model.sh0[:-1], model.shN)
     with pytest.raises(InputError, match="origin has 5 splats, expected 4"):
         EncodePlan.of(model, origin=Origin(9, np.arange(5)))
 
@@ -62,8 +46,8 @@ def test_colours_and_an_origin_of_other_splats_are_refused(make_model):
 @pytest.mark.slow
 def test_a_part_with_other_colours_or_shapes_declares_the_errors_of_the_rest(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
-    plan = EncodePlan.of(source.select(rows), origin=Origin(400, rows))
-    refitted = encode_tiles(plan.with_colours(plan.scene.sh0 + 1, plan.scene.shN)).write()
+    colours = replace(source, sh0=source.sh0 + 1).select(rows)
+    refitted = encode_planned(EncodePlan.of(colours, origin=Origin(400, rows, refitted=True)))
     shapes = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
     adjusted = encode_planned(EncodePlan.of(shapes, origin=Origin(400, rows, refitted=True, adjusted=True)))
     for result, declared in ((refitted, ["means", "covariance", "opacities"]), (adjusted, ["means"])):
