@@ -10,7 +10,7 @@ from csplat import LimitError
 from csplat.scene import join_blocks
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.level_fitting import LevelFitter, Work, surroundings_of, thin_out
+from csplat_tools.level_fitting import LevelFitter, Work, make_backdrop
 from csplat_tools.level_merging import light_of, merge_neighbours
 
 
@@ -23,8 +23,7 @@ def sample(sample_path):
 def test_fitted_levels_look_better_than_merged_ones(sample):
     model, nodes = sample.select(slice(0, 1200)), np.zeros(1200, np.int64)
     others = sample.select(slice(1200, None))
-    around = surroundings_of(model, thin_out(sample, len(sample)))
-    fitters = LevelFitter(model, around), LevelFitter(model)  # with all steps
+    fitters = LevelFitter(model, make_backdrop(sample, len(sample))), LevelFitter(model)  # with all steps
     levels = merge_neighbours(model, nodes, 300)[1], *(fitter.fit(model, nodes, 300, 1)[1] for fitter in fitters)
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     within = Scorer.of_source(sample, virtual_cameras(sample, 3, 96, 72))
@@ -53,18 +52,16 @@ def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(sample):
     assert splats.opacities[kept == 1].min() >= np.sort(scene.opacities[300:])[-39]
 
 
-def test_thinned_splats_cover_as_much_as_the_scene_and_do_not_stand_for_a_part(sample, monkeypatch):
-    monkeypatch.setattr("csplat_tools.level_fitting._SURROUNDINGS", 400)
-    drawn = sample.select(np.arange(0, len(sample), 2))
-    thinned = thin_out(drawn, len(sample))
-    assert 200 < len(thinned) <= 400
-    assert light_of(thinned).sum() == pytest.approx(light_of(sample).sum(), rel=0.2)
+def test_a_backdrop_covers_as_much_as_the_scene_and_does_not_stand_for_the_part(sample):
+    backdrop = make_backdrop(sample.select(np.arange(0, len(sample), 2)), len(sample), most=400)
+    assert 200 < len(backdrop) <= 400
+    assert light_of(backdrop).sum() == pytest.approx(light_of(sample).sum(), rel=0.2)
     part = sample.select(np.arange(1000))
-    others = surroundings_of(part, thinned)
-    assert sample.shN.shape[1:] == others.shN.shape[1:]
-    inside = (thinned.means[:, None] == part.means).all(axis=2).any(axis=1)
-    np.testing.assert_array_equal(thinned.means[~inside], others.means)
-    assert 0 < np.count_nonzero(inside) < len(thinned)
+    rest = LevelFitter(part, backdrop)._rest
+    assert part.shN.shape[1:] == rest.shN.shape[1:]
+    inside = (backdrop.means[:, None] == part.means).all(axis=2).any(axis=1)
+    np.testing.assert_array_equal(backdrop.means[~inside], rest.means)
+    assert 0 < np.count_nonzero(inside) < len(backdrop)
 
 
 class Crowded(LevelFitter):

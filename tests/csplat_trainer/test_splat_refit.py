@@ -53,28 +53,28 @@ def test_centres_move_back_if_a_refit_moves_them(source):
     assert (np.abs(moved.means - shifted.means) <= 30 * sizes).all()
 
 
-@pytest.mark.parametrize("moved", [0, 5, 16, 37, None])
-def test_a_step_moves_the_first_splats_alone(source, moved):
+@pytest.mark.parametrize("fitted", [0, 5, 16, 37, None])
+def test_a_step_fits_the_first_splats_alone(source, fitted):
     (camera,) = camera_sequence(source, 1, (48, 36))
     parameters = Parameters.starting_at(from_model(source, source.sh_degree))
     before = {name: array.copy() for name, array in parameters.values.items()}
-    step = parameters.next_step(dict.fromkeys(before, 0.01), moved=moved)
+    step = parameters.next_step(dict.fromkeys(before, 0.01), fitted_count=fitted)
     splats = UncheckedSplats(**{"opacities" if name == "logits" else name: parameters.values[name] for name in before})
     Rasteriser().refit(splats, camera, np.ones((36, 48, 3), np.float32), step)
     changed = np.zeros(len(source), bool)
     for name, array in parameters.values.items():
         changed |= (array != before[name]).reshape(len(source), -1).any(axis=1)
-    count = len(source) if moved is None else moved
+    count = len(source) if fitted is None else fitted
     assert not changed[count:].any()
     assert not count or changed[:count].any()
 
 
-def test_surroundings_are_shown_and_not_changed(source):
+def test_a_backdrop_is_shown_and_not_changed(source):
     cameras = camera_sequence(source, 8, (48, 36))
     half, around = (source.select(np.arange(first, len(source), 2)) for first in (0, 1))
     half = replace(half, sh0=half.sh0 + np.float32(0.3))
     wanted = render_all(source, cameras)
-    adjusted = refit_splats(half, cameras, wanted, steps=64, surroundings=around, moves=True)
+    adjusted = refit_splats(half, cameras, wanted, steps=64, backdrop=around, moves=True)
     assert len(half) == len(adjusted)
     errors = [
         np.square(np.subtract(render_all(join_blocks(part, [part, around]), cameras), wanted)).mean()

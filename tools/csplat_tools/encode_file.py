@@ -27,6 +27,7 @@ from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_s
 
 _PLY_FACTOR = 8  # memory of an encoding divided by the size of its PLY, at most; 3 for float32 columns, more for bytes
 _MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
+_CUT = "the dropped SH bands are cut off: projecting them onto the others requires the scene in memory, without bounds"
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -58,9 +59,6 @@ def describe_levels(scene: Scene, options: EncodeOptions, context: Context = DEF
     seconds, growth = more.seconds - cost.seconds, more.file_bytes / cost.file_bytes - 1.0
     price = f"about {format_estimate(seconds)} more, {100.0 * growth:.0f} % more bytes"
     return [f"viewers show a scene of {scene.count:,} splats sooner with levels of detail: --levels auto ({price})"]
-
-
-_CUT = "the dropped SH bands are cut off: projecting them onto the others requires the scene in memory, without bounds"
 
 
 @dataclass(frozen=True)
@@ -193,7 +191,7 @@ def encode_file(
                 raise
             result, interrupt = caught.best, caught
         if drops and importance is None and (scene.in_memory is None or context.is_bounded):
-            result = replace(result, report=replace(result.report, notes=(*result.report.notes, _CUT)))
+            result = result.with_notes(_CUT)
         if scene.in_memory is not None:
             write_bytes(output, result.data)
         if source_index is not None:

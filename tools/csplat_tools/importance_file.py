@@ -101,7 +101,7 @@ def encode_by_importance(
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
         result = encode_with_report(model, options, levels=levels, importance=weights, context=context)
-        return _with_notes(result, *notes)
+        return result.with_notes(*notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{path}: no view saw any splat, so all would be pruned")
@@ -113,7 +113,7 @@ def encode_by_importance(
     if stored.missed_share > 0.0:  # NaN if no view was held out
         missed = f"{100 * stored.missed_share:.1f} % of the splats were pruned although held-out views saw them:"
         notes = (*notes, f"{missed} `csplat sensitivity` with more views misses fewer")
-    return _with_notes(result, *notes)
+    return result.with_notes(*notes)
 
 
 def encode_fewer_bands(
@@ -129,10 +129,10 @@ def encode_fewer_bands(
         weights = measure_importance(model, cameras, BLACK, matrices=True, context=context)
     except InputError as error:
         result = encode_with_report(model, options, levels=levels, context=context)
-        return _with_notes(result, f"the dropped SH bands are not projected onto the others: {error}")
+        return result.with_notes(f"the dropped SH bands are not projected onto the others: {error}")
     weights = replace(weights, blocks=None, shape_metric=None)
     result = encode_with_report(model, options, levels=levels, importance=weights, context=context)
-    return _with_notes(result, _PROJECTED)
+    return result.with_notes(_PROJECTED)
 
 
 def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
@@ -140,8 +140,3 @@ def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> 
     if (options.max_classes or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
     return (_ONE_CLASS,)
-
-
-def _with_notes(result: EncodeResult, *notes: str) -> EncodeResult:
-    """Return a result with notes added to its report."""
-    return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))

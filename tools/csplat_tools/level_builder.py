@@ -79,7 +79,7 @@ class FittedLevelBuilder:
         fits: levels are fitted to renders; otherwise, neighbours are only merged in scenes of any size.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
-        thinned: splats that stand for the scene of the buckets, if their levels are fitted.
+        backdrop: splats that stand for the scene of the buckets, if their levels are fitted; see `make_backdrop`.
     """
 
     count: int | None = None
@@ -90,7 +90,7 @@ class FittedLevelBuilder:
     fits: bool = True
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
-    thinned: SplatModel | None = field(default=None, compare=False, repr=False)
+    backdrop: SplatModel | None = field(default=None, compare=False, repr=False)
 
     def settings(self, count: int) -> dict[str, Any]:
         """Return what the OPTS chunk of a scene of `count` splats states."""
@@ -154,10 +154,10 @@ class FittedLevelBuilder:
         return nodes + [_renumber(node, len(nodes)) for node in top]
 
     def of_scene(self, sample: SplatModel, count: int) -> FittedLevelBuilder:
-        """Return the builder for the buckets of a scene of `count` splats, of which the sample was evenly drawn."""
-        from csplat_tools.level_fitting import thin_out
+        """Return the builder for the buckets of a scene of `count` splats, given an evenly spaced sample."""
+        from csplat_tools.level_fitting import make_backdrop
 
-        return replace(self, thinned=thin_out(sample, count) if self._is_fitted(count) else None)
+        return replace(self, backdrop=make_backdrop(sample, count) if self._is_fitted(count) else None)
 
     def build_part(self, splats: SplatModel, context: Context, coding: LevelCoding | None = None) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
@@ -167,13 +167,12 @@ class FittedLevelBuilder:
             context: threads and progress.
             coding: how the file codes levels.
         """
-        from csplat_tools.level_fitting import PART_WORK, LevelFitter, surroundings_of
+        from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
         splats = _plain(splats)
         fit: _Fit = _merge_only
-        if self.thinned is not None:
-            around = surroundings_of(splats, self.thinned)
-            fit = LevelFitter(splats, around, work=PART_WORK, coding=coding, context=context).fit
+        if self.backdrop is not None:
+            fit = LevelFitter(splats, self.backdrop, work=PART_WORK, coding=coding, context=context).fit
         with thread_count(context.threads):
             return self._build_leaves(splats, fit, self._part_levels)
 

@@ -1,8 +1,8 @@
 """Fit the splats of a level of detail: keep splats that matter in renders, and refit them to renders of the scene.
 
 Views around the scene become smaller from level to level, so that a level is as good as it can be at the pixel size at
-which it is shown. In a part of a larger scene, splats are merged instead, and refitted between splats that stand for
-the others. Work is bounded.
+which it is shown. In a part of a larger scene, splats are merged instead, and refitted together with a backdrop: a
+few splats that stand for the rest of the scene. Work is bounded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
 #: Factor of the largest distance of views in a surrounding scene, since coarse levels are seen from farther away.
 #: Levels 1 and 2 of garden500k gain 0.7 and 1.2 dB at a distance of 1.3 extents, and lose 0.6 and 0.3 at 0.8.
 _REACH = 1.5
-_SURROUNDINGS = 1 << 15  # largest number of splats that stand for a scene
+_BACKDROP_SPLATS = 1 << 15  # largest number of splats of a backdrop
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
 
@@ -67,16 +67,16 @@ class LevelFitter:
 
     Attributes:
         scene: a scene or a part of a scene, in whose renders levels are measured.
-        surroundings: splats that stand for the others, if the scene is a part of a larger one. Views are those of the
-            larger scene, turned to the part, and neighbours are merged: choosing splats would take several times as
-            many views.
+        backdrop: splats that stand for the larger scene of which the scene is a part, see `make_backdrop`. Views
+            look at the part, and neighbours are merged: choosing splats would take several times as many views. `None`:
+            the scene is whole.
         work: how much is done.
         coding: how the file codes levels; splats are fitted around the SH that the file will have. `None`: unknown.
         context: threads and progress.
     """
 
     scene: SplatModel
-    surroundings: SplatModel | None = None
+    backdrop: SplatModel | None = None
     work: Work = SCENE_WORK
     coding: LevelCoding | None = None
     context: Context = DEFAULT_CONTEXT
@@ -121,7 +121,7 @@ class LevelFitter:
         cameras = [resized(camera, width, width * 3 // 4) for camera in self._cameras]
         held_out, used = cameras[: -self._view_count], cameras[-self._view_count :]
         renders: list[F16] = []
-        if self.surroundings is not None:
+        if self.backdrop is not None:
             nodes, chosen = merge_neighbours(finer, nodes, count)
         else:
             rows, renders = self._choose_rows(finer, nodes, count, used, context)
@@ -129,20 +129,30 @@ class LevelFitter:
         if self.coding is not None:
             chosen = self.coding.with_coded_sh(chosen)
         if not renders or level > 1:
-            draw = renderer(self._shown(self.scene), (0.0, 0.0, 0.0), context=self.context)
+            draw = renderer(self._source, (0.0, 0.0, 0.0), context=self.context)
             renders = [draw(camera).rgb.astype(np.float16) for camera in used]
         fitted = refit_splats(
-            chosen, used, renders, steps=self._steps(len(chosen)), surroundings=self.surroundings, moves=True,
+            chosen, used, renders, steps=self._steps(len(chosen)), backdrop=self._rest, moves=True,
             context=context,
         )  # fmt: skip
         quiet = replace(self.context, progress=null_progress)
-        scorer = Scorer.of_source(self._shown(self.scene), held_out, context=quiet)
-        before, after = (scorer.psnr(self._shown(splats)) for splats in (chosen, fitted))
+        scorer = Scorer.of_source(self._source, held_out, context=quiet)
+        before, after = (scorer.psnr(self._with_rest(splats)) for splats in (chosen, fitted))
         return nodes, fitted if after >= before else chosen
 
-    def _shown(self, splats: SplatModel) -> SplatModel:
-        """Return splats of the part with those around it, which views show, too."""
-        return splats if self.surroundings is None else join_blocks(splats, [splats, self.surroundings])
+    @cached_property
+    def _rest(self) -> SplatModel | None:
+        """The backdrop without the splats that stand for the part itself."""
+        return None if self.backdrop is None else _without_part(self.backdrop, self.scene)
+
+    @cached_property
+    def _source(self) -> SplatModel:
+        """The scene as views show it."""
+        return self._with_rest(self.scene)
+
+    def _with_rest(self, splats: SplatModel) -> SplatModel:
+        """Return splats of a part, followed by the backdrop."""
+        return splats if self._rest is None else join_blocks(splats, [splats, self._rest])
 
     @property
     def _view_count(self) -> int:
@@ -163,8 +173,8 @@ class LevelFitter:
         """The views of level 1: `HELD_OUT_COUNT` or fewer held-out views, then those to fit to."""
         width = self._width(1)
         count, size = self._view_count + min(self._view_count // _CHECKS_EVERY, HELD_OUT_COUNT), (width, width * 3 // 4)
-        if self.surroundings is not None:
-            return cameras_on_part(self._shown(self.scene), self.scene, count, size, reach=_REACH)
+        if self.backdrop is not None:
+            return cameras_on_part(self._source, self.scene, count, size, reach=_REACH)
         return camera_sequence(self.scene, count, size, reach=_REACH)
 
     @staticmethod
@@ -202,30 +212,32 @@ class LevelFitter:
         return np.union1d(rows, brightest[~np.isin(nodes[brightest], nodes[rows])]), renders
 
 
-def thin_out(sample: SplatModel, scene_count: int) -> SplatModel:
-    """Return few splats that stand for a scene, without SH, to render a part of it between them.
+def make_backdrop(sample: SplatModel, scene_count: int, most: int = _BACKDROP_SPLATS) -> SplatModel:
+    """Return a few splats that stand for a scene, without SH, with which parts of it are fitted.
 
-    They are drawn in proportion to opacity times area, and the smaller ones are enlarged to cover as much as the scene.
+    They are chosen in proportion to opacity times area, and the smaller ones are enlarged, so that they cover about as
+    much as the scene.
 
     Args:
-        sample: evenly drawn splats of the scene.
+        sample: an evenly spaced sample of the scene.
         scene_count: number of splats of the scene.
+        most: largest number of splats to return.
     """
     light = light_of(sample)
-    least = float(light.sum()) / _SURROUNDINGS  # of a splat that is drawn with certainty
-    drawn = np.cumsum(np.minimum(light / least, 1.0)) + 0.5
-    rows = np.flatnonzero(np.diff(np.floor(drawn), prepend=0.0))
+    least = float(light.sum()) / most  # light from which on a splat is always chosen
+    chances = np.minimum(light / least, 1.0)
+    rows = np.flatnonzero(np.diff(np.floor(np.cumsum(chances) + 0.5), prepend=0.0))
     growth = np.maximum(least * scene_count / len(sample) / light[rows], 1.0)
     chosen = sample.select(rows)
     scales = (chosen.scales + 0.5 * np.log(growth)[:, None]).astype(np.float32)
     return replace(chosen, scales=scales, shN=chosen.shN[:, :0], extra={}, means_double=None)
 
 
-def surroundings_of(part: SplatModel, thinned: SplatModel) -> SplatModel:
-    """Return the splats of a thinned scene that do not stand for a part of it, with as many SH coefficients."""
-    bits = np.dtype([("", np.uint32)] * 3)  # of the coordinates of a mean
-    own, others = (np.ascontiguousarray(splats.means).view(bits)[:, 0] for splats in (part, thinned))
-    chosen = thinned.select(np.flatnonzero(~np.isin(others, own)))
+def _without_part(backdrop: SplatModel, part: SplatModel) -> SplatModel:
+    """Return the splats of a backdrop whose means no splat of a part has, with as many SH coefficients as the part."""
+    kind = np.dtype([("", np.uint32)] * 3)  # a mean as one value that compares bit by bit
+    own, all_means = (np.ascontiguousarray(splats.means).view(kind)[:, 0] for splats in (part, backdrop))
+    chosen = backdrop.select(np.flatnonzero(~np.isin(all_means, own)))
     return replace(chosen, shN=np.zeros((len(chosen), *part.shN.shape[1:]), np.float32))
 
 

@@ -76,7 +76,7 @@ class _Step(ctypes.Structure):
         ("groups", _Group * len(FITTED)),
         *((name, ctypes.c_double) for name in ("over_root", "beta2", "opacity_weight", "scale_weight")),
         *((name, ctypes.c_void_p) for name in ("mean_sizes", "means2d")),
-        ("moved", ctypes.c_int64),
+        ("fitted_count", ctypes.c_int64),
     ]
 
 
@@ -94,7 +94,7 @@ class AdamStep:
         scale_weight: weight of the sum of standard deviations.
         mean_sizes: [N] float32, factor of the step of each mean; `None`: 1.
         means2d: [N] float32, written: the norms of `Gradients.means2d`; `None`: not needed.
-        moved: number of splats to move, the first ones; `None`: all.
+        fitted_count: number of splats to fit, the first ones; `None`: all.
     """
 
     values: Mapping[str, F32]
@@ -107,7 +107,7 @@ class AdamStep:
     scale_weight: float = 0.0
     mean_sizes: F32 | None = None
     means2d: F32 | None = None
-    moved: int | None = None
+    fitted_count: int | None = None
 
     def as_c(self, splats: UncheckedSplats) -> _Step:
         """Return the step for the library; its values have the shapes of these splats."""
@@ -128,7 +128,7 @@ class AdamStep:
         for name in ("over_root", "beta2", "opacity_weight", "scale_weight"):
             setattr(step, name, getattr(self, name))
         step.mean_sizes, step.means2d = address(self.mean_sizes), address(self.means2d)
-        step.moved = len(self.values["logits"]) if self.moved is None else self.moved
+        step.fitted_count = len(self.values["logits"]) if self.fitted_count is None else self.fitted_count
         return step
 
 

@@ -53,7 +53,7 @@ def refit_splats(
     *,
     steps: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
-    surroundings: SplatModel | None = None,
+    backdrop: SplatModel | None = None,
     moves: bool = False,
     context: Context = DEFAULT_CONTEXT,
 ) -> SplatModel:
@@ -65,7 +65,7 @@ def refit_splats(
         references: [H, W, 3] float32 or float16, the reference image of each view.
         steps: number of steps, one view each.
         background: red, green, blue behind the splats.
-        surroundings: splats around the scene, which are rendered and not changed.
+        backdrop: splats of the rest of the scene, which are rendered with it and not changed.
         moves: fit the centres instead of `shN`, whose values codebooks then still have; `means_double` is dropped.
         context: threads, progress, and the seed of the order of the views.
 
@@ -75,9 +75,9 @@ def refit_splats(
     views = _TrainingViews(cameras, references, background, model.metadata.antialiased, context)
     order = _order_in_space(model.means)  # makes a step up to a fifth faster
     shown = model.select(order)
-    if surroundings is not None:
-        shown = join_blocks(shown, [shown, surroundings])
-    refit = _FloatRefit(views, steps, context, shown, moves=moves, moved=len(model))
+    if backdrop is not None:
+        shown = join_blocks(shown, [shown, backdrop])
+    refit = _FloatRefit(views, steps, context, shown, moves=moves, fitted_count=len(model))
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
     return refit.applied_to(shown).select(np.argsort(order))
@@ -219,7 +219,7 @@ class _FloatRefit(_Refit):
         views, steps, context: as for `_Refit`.
         model: the scene.
         moves: fit the centres instead of `shN`.
-        moved: number of splats to fit, the first.
+        fitted_count: number of splats to fit, the first ones.
     """
 
     def __init__(
@@ -230,10 +230,10 @@ class _FloatRefit(_Refit):
         model: SplatModel,
         *,
         moves: bool,
-        moved: int,
+        fitted_count: int,
     ) -> None:
         super().__init__(views, steps, context)
-        self._start, self._moves, self._moved = model, moves, moved
+        self._start, self._moves, self._fitted_count = model, moves, fitted_count
         values = _values_to_fit(model)
         if moves:
             del values["shN"]
@@ -256,7 +256,9 @@ class _FloatRefit(_Refit):
 
     def _make_step(self, view: int, rates: dict[str, float]) -> float:
         sizes = self._sizes if self._moves else None
-        step = self._parameters.next_step({**rates, "means": rates["offsets"]}, mean_sizes=sizes, moved=self._moved)
+        step = self._parameters.next_step(
+            {**rates, "means": rates["offsets"]}, mean_sizes=sizes, fitted_count=self._fitted_count
+        )
         return self._views.refit(self._fitted(), view, step)
 
     def applied_to(self, before: SplatModel) -> SplatModel:

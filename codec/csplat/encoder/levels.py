@@ -136,7 +136,7 @@ class LevelBuilder(Protocol):
         ...
 
     def of_scene(self, sample: SplatModel, count: int) -> LevelBuilder:
-        """Return the builder for the buckets of a scene of `count` splats, of which the sample was evenly drawn."""
+        """Return the builder for the buckets of a scene of `count` splats, given an evenly spaced sample."""
         ...
 
     def build_part(self, splats: SplatModel, context: Context, coding: LevelCoding | None = None) -> list[LevelNode]:

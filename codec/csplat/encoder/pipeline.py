@@ -156,6 +156,10 @@ class EncodeResult:
         """Return the same file with the report of a search."""
         return replace(self, report=replace(self.report, search=search))
 
+    def with_notes(self, *notes: str) -> EncodeResult:
+        """Return the same file with notes added to its report."""
+        return replace(self, report=replace(self.report, notes=(*self.report.notes, *notes)))
+
 
 @dataclass(frozen=True)
 class EncodedTile:

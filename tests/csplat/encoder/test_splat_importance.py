@@ -80,7 +80,7 @@ def test_dropped_bands_are_projected_where_splats_are_seen(make_model, degree):
         for view in (cap, others)
     )
     assert seen[1] < 0.35 * seen[0]
-    assert unseen[1] < 4.0 * unseen[0]  # a fifth of the matrix is that of all directions
+    assert unseen[1] < 4.0 * unseen[0]  # part of the matrix is that of all directions
     model.shN[0], model.shN[1] = 3e38, -1e20
     extreme = project_sh(model, degree, seen_from(cap, len(model)))
     assert np.isfinite(extreme.sh0).all()

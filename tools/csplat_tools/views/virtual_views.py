@@ -123,8 +123,11 @@ def cameras_on_part(
 ) -> list[Camera]:
     """Place virtual cameras around a scene, and turn them to a part of it.
 
+    If the part has most of the splats, the cameras are mostly around the part. This suits levels of detail: with
+    cameras around the whole scene, levels 1 and 2 of garden500k in buckets have 0.7 dB less.
+
     Args:
-        scene: the scene, or a sample of it.
+        scene: the part together with splats that stand for the rest.
         part: splats of the scene. A part that is small from a camera fills its view; of a larger part, some place is
             in the middle of the view.
         count, size, seed, reach: as for `camera_sequence`.

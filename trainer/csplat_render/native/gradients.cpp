@@ -456,8 +456,8 @@ CSPLAT_API int64_t csplat_step(int64_t threads, Renderer* renderer, const Splats
     *error = blend_gradients(threads, *renderer, *view, {gradient, nullptr, nullptr}, reference);
     const Weights weights = {step->opacity_weight, step->scale_weight};
     const float over_root = static_cast<float>(step->over_root), beta2 = static_cast<float>(step->beta2);
-    for_each_block(threads, (step->moved + kBlock - 1) / kBlock, [&](int64_t block) {
-      const int64_t first = block * kBlock, count = std::min<int64_t>(kBlock, step->moved - first);
+    for_each_block(threads, (step->fitted_count + kBlock - 1) / kBlock, [&](int64_t block) {
+      const int64_t first = block * kBlock, count = std::min<int64_t>(kBlock, step->fitted_count - first);
       BlockGradients g;
       if (renderer->drawn[block])
         block_gradients(*renderer, *splats, *view, block, step->groups[0].values, g);

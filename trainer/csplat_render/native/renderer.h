@@ -56,7 +56,7 @@ struct Step {
   double opacity_weight, scale_weight;  // of regularisers
   const float* mean_sizes;      // [N], factor of the step of each mean, or null
   float* means2d;               // [N], written: see `Gradients`; or null
-  int64_t moved;                // number of splats to move, the first ones
+  int64_t fitted_count;         // number of splats to fit, the first ones
 };
 
 // An array aligned to cache lines, which only grows.
