@@ -27,6 +27,7 @@ ROUND_FRACTION = 0.72
 
 _UNDRAWN_KEY, _UNSEEN_KEY = -1.0, -0.5  # keys of splats to prune before all others, in this order
 _F16_MAX = float(np.finfo(np.float16).max)
+_GROUPS_AGAIN = 2  # groups of views in which refitted splats are measured; with all, PSNR rises by less than 0.1 dB
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -76,6 +77,8 @@ class MeasuredViews:
 class PruningOrder:
     """The splats of a scene in the order of pruning, without splats that no view shows. The order grows on demand.
 
+    Splats that are left may be refitted in between; `continue_with` measures them again, with their new values.
+
     Attributes:
         model: the scene.
         groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
@@ -83,8 +86,9 @@ class PruningOrder:
         background: background colour of the views.
         context: threads and progress.
         rows: [G] int64, indices of splats in the order of pruning.
-        errors: [G], error of removing each, measured in its round: summed over pixels, channels and views.
+        errors: [G], mean squared error of removing each from the renders, measured in its round.
         rounds: number of pruned splats by round.
+        view_count: number of renders in which errors were measured again.
         seen: [N] bool, True for splats that are visible in a view.
     """
 
@@ -95,21 +99,21 @@ class PruningOrder:
     rows: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
     errors: F64 = field(default_factory=lambda: np.zeros(0), init=False)
     rounds: list[int] = field(default_factory=list, init=False)
+    view_count: int = field(default=0, init=False)
     seen: Mask = field(init=False)
     _left: I64 = field(init=False)
+    _values: SplatModel = field(init=False)  # values of the splats in the ascending rows `_value_rows`
+    _value_rows: I64 = field(init=False)
+    _is_measured: bool = field(default=True, init=False)  # all groups were measured with the splats that are left
 
     def __post_init__(self) -> None:
-        self._left = np.arange(len(self.model))
+        self._left = self._value_rows = np.arange(len(self.model))
+        self._values = self.model
         self.seen = total_error(self.groups).seen
 
-    @property
-    def value_count(self) -> int:
-        """Number of pixels times channels of all views."""
-        return sum(group.pruning_error.value_count for group in self.groups)
-
     def mean_errors(self) -> F64:
-        """Return [G + 1], the sum of the errors of the first 0, 1, … G splats, as a mean squared error."""
-        sums: F64 = np.concatenate([[0.0], np.cumsum(self.errors)]) / self.value_count
+        """Return [G + 1], the sum of the errors of the first 0, 1, … G splats."""
+        sums: F64 = np.concatenate([[0.0], np.cumsum(self.errors)])
         return sums
 
     def kept(self, count: int) -> I64:
@@ -123,7 +127,7 @@ class PruningOrder:
         """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
         done = 1.0
-        while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
+        while len(self._left) > least and float(self.errors.sum()) <= error:
             if not self._prune_round(max(least, int(len(self._left) * ROUND_FRACTION))):
                 break
             done = len(self.rows) / len(self.model)
@@ -131,26 +135,49 @@ class PruningOrder:
         if done < 1.0:
             self.context.progress("ordering splats", 1.0)
 
+    def continue_with(self, refitted: SplatModel) -> None:
+        """Order all but the first splats anew, by errors that are measured with refitted values in some of the views.
+
+        Args:
+            refitted: the splats `kept(len(refitted))`, with other values.
+        """
+        pruned_count = len(self.model) - len(refitted)
+        self._value_rows, self._values = self.kept(len(refitted)), refitted
+        assert len(self._value_rows) == len(refitted)
+        self._left = self._value_rows
+        self.rows, self.errors = self.rows[:pruned_count], self.errors[:pruned_count]
+        ends = np.minimum(np.cumsum(self.rounds), pruned_count)
+        self.rounds = [int(count) for count in np.diff(ends, prepend=0) if count]
+        self.groups = [self._measured(refitted, group.cameras) for group in self.groups[:_GROUPS_AGAIN]]
+        self._is_measured = True
+
+    def _measured(self, left: SplatModel, cameras: Sequence[Camera]) -> MeasuredViews:
+        """Measure the pruning errors of the splats that are left."""
+        self.view_count += len(cameras)
+        quiet = replace(self.context, progress=null_progress)
+        return MeasuredViews.of(left, cameras, self.background, context=quiet)
+
     def _prune_round(self, count: int) -> bool:
-        """Prune until `count` splats are left, after measuring the next group of views again, but for the first round.
+        """Prune until `count` splats are left, after measuring the next group of views again unless all are measured.
 
         Unseen splats are kept, so more may be left.
 
         Returns:
             False if no splat can be pruned.
         """
-        if self.rounds:
+        places = np.searchsorted(self._value_rows, self._left)
+        if not self._is_measured:
             turn = (len(self.rounds) - 1) % len(self.groups)  # the groups take turns
-            left, cameras = self.model.select(self._left), self.groups[turn].cameras
-            quiet = replace(self.context, progress=null_progress)
-            self.groups[turn] = MeasuredViews.of(left, cameras, self.background, context=quiet)
-        keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups))
+            self.groups[turn] = self._measured(self._values.select(places), self.groups[turn].cameras)
+        self._is_measured = False
+        pruning_error = total_error(self.groups)
+        keys = pruning_keys(self._values.opacities[places], pruning_error)
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]
         if not len(order):
             return False
         self.rows = np.concatenate([self.rows, self._left[order]])
-        self.errors = np.concatenate([self.errors, np.maximum(keys[order], 0.0)])  # 0 for undrawn splats
+        self.errors = np.concatenate([self.errors, np.maximum(keys[order], 0.0) / pruning_error.value_count])
         self.rounds.append(len(order))
         kept = np.delete(np.arange(len(keys)), order)
         self._left = self._left[kept]

@@ -88,11 +88,34 @@ def test_rounds_alternate_between_groups_of_views(source):
     first, second = order.rounds
     rows = order.kept(len(source) - first)
     keys = pruning_keys(source.opacities, total_error(view_groups))
-    np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
+    values = 3 * 48 * 36 * 8
+    np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first] / values)
     again = measure_pruning_error(source.select(rows), parts[0]).error + view_groups[1].pruning_error.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
-    np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
+    np.testing.assert_allclose(order.errors[first:], again[places] / values, rtol=1e-9)
     assert 200 == first + second
+
+
+def test_an_order_continues_with_the_errors_of_refitted_splats(source):
+    cameras = camera_sequence(source, 8, (48, 36))
+    order = PruningOrder(
+        source, [MeasuredViews.of(source, part, (0.0, 0.0, 0.0)) for part in (cameras[::2], cameras[1::2])]
+    )
+    order.extend(kept_count=100)
+    first, rows = order.rows[:100], order.kept(len(source) - 100)
+    refitted = source.select(rows)
+    refitted = replace(refitted, opacities=refitted.opacities[::-1].copy())
+    order.continue_with(refitted)
+    assert 100 == len(order.rows) == len(order.errors) == sum(order.rounds)
+    kept = order.kept(len(source) - 140)
+    np.testing.assert_array_equal(first, order.rows[:100])
+    measured = measure_pruning_error(refitted, cameras)
+    least = np.argsort(pruning_keys(refitted.opacities, measured), kind="stable")[:40]
+    np.testing.assert_array_equal(rows[least], order.rows[100:])
+    np.testing.assert_array_equal(np.delete(rows, least), kept)
+    later = order.view_count
+    order.kept(len(source) - 200)
+    assert later + 4 == order.view_count  # the groups take turns again
 
 
 @pytest.mark.slow

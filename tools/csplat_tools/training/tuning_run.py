@@ -293,7 +293,7 @@ class Tuner:
         with self._timer.stage("choosing"):
             rows = self.rows
             if kept_count is not None and kept_count < len(rows):
-                kept = self._pruner(self._pruning_options).refit(kept_count)
+                kept = self._pruner(self._pruning_options).refit_in_rounds(kept_count)
                 model, rows = kept.model, rows[kept.rows]
             else:
                 model = self.source.select(rows)
