@@ -27,8 +27,10 @@ def test_saved_cameras_are_loaded_exactly_and_near_and_image_may_be_left_out(tmp
     ]
     save_cameras(tmp_path / "c.json", cameras)
     assert [camera.to_json() for camera in cameras] == [c.to_json() for c in load_cameras(tmp_path / "c.json")]
-    (bare,) = load_cameras(written(tmp_path, [{"K": K.tolist(), "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}]))
-    assert (0.2, None) == (bare.near, bare.image)
+    least = {"K": K.tolist(), "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
+    for further in ({}, {"background": [1.0, 1.0, 1.0]}):  # unknown keys are ignored
+        (bare,) = load_cameras(written(tmp_path, [least | further]))
+        assert (0.2, None) == (bare.near, bare.image)
 
 
 def test_cameras_relative_to_the_origin_or_to_0_are_distinguished(tmp_path):

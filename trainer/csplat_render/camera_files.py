@@ -334,8 +334,9 @@ def _parse_own_cameras(entries: object, path: Path) -> list[Camera]:
         InputError: a camera is invalid, or there are none; the message names the contents of known other files.
     """
     first = entries[0] if isinstance(entries, list) and entries else entries
-    hints = [hint for fields, hint in _UNREAD if isinstance(first, Mapping) and fields <= first.keys()]
-    if hints:
+    keys = first.keys() if isinstance(first, Mapping) else set[str]()
+    hints = [hint for fields, hint in _UNREAD if fields <= keys]
+    if hints and not {"K", "viewmat"} <= keys:  # cameras may have further keys
         raise InputError(f"{path} {hints[0]}")
     if not isinstance(entries, list) or not entries:
         raise InputError(
