@@ -158,7 +158,8 @@ class SearchReport:
         images: PSNR of `file` and `source` against the test images, if any.
         worst_psnr: PSNR of the worst view, dB.
         spread: standard deviation of the PSNR over other choices of such views, dB.
-        elsewhere: PSNR on virtual views that were not used in the search, dB, by kind.
+        elsewhere: PSNR on views that were not used in the search, dB, by kind: virtual views beside, nearer and
+            farther, or views between, beside and beyond given cameras.
         views: number of test views.
         views_of: source of the views: `virtual`, or a name.
         renders: number of scored renders.

@@ -136,7 +136,11 @@ def test_json_has_psnr_at_the_top_and_renders_are_written_side_by_side(scene, ca
     assert result["attributes"]["errors"]["means"]["rms"] > 0.0
     assert (3, True) == (len(result["views"]), result["seconds"] > 0.0)
     pictures = ("--pictures", tmp_path / "out")
-    assert "psnr_worst" in call(*words, *pictures).stdout
+    assert {"between", "beside", "beyond"} == result["elsewhere"].keys()
+    assert min(result["elsewhere"].values()) > 15.0
+    text = call(*words, *pictures).stdout
+    assert "psnr_worst" in text
+    assert f"{result['elsewhere']['beside']:.2f} dB" in text
     assert ["0000.png", "0002.png", "side.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
     with Image.open(tmp_path / "out" / "side.png") as picture:
         assert (3 * 64, 48) == picture.size

@@ -62,7 +62,7 @@ def test_the_spread_is_over_views_and_the_psnr_of_extra_views_is_reported():
     assert 0.0 == psnr_spread(np.full(8, 1e-4))
     assert 10 * math.log10(4) / 2 == pytest.approx(psnr_spread(np.array([1e-4, 4e-4])))
     assert math.isnan(psnr_spread(np.array([1e-4])))
-    for psnr, note in ((39.5, "39.50 at other"), (37.0, "positions: up to 3.0 dB less")):
+    for psnr, note in ((39.5, "39.50 beside"), (37.0, "beside: up to 3.0 dB less")):
         report = SearchReport(
             {"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, validation_psnr=40.1, elsewhere={"beside": psnr}
         )
@@ -89,7 +89,7 @@ def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
     assert ({"psnr": 30.0}, 10) == (report.goal, report.views)
     assert len(report.tried) == report.encodes
     assert report.worst_psnr <= report.psnr
-    assert {"beside", "nearer", "farther"} == set(report.elsewhere)
+    assert {"between", "beside", "beyond"} == set(report.elsewhere)  # the path of the cameras
     assert report.pruning_views > 0
     json.dumps(report.as_json(), allow_nan=False)
 

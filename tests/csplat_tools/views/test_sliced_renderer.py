@@ -198,6 +198,7 @@ def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, vi
         shown = json.loads(result.stdout)
         images = [image.read_bytes() for image in sorted((tmp_path / name).iterdir())]
         by_disk = "rendered from the disk" in result.stderr
+        assert by_disk == (not shown.pop("elsewhere"))  # views off the path are not rendered out of core
         return by_disk, shown["attributes"].pop("errors"), (shown | {"seconds": 0}, images)
 
     by_disk, errors, in_memory = report("memory")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,10 +18,6 @@ from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import findings_of, load_scene, open_scenes, sample_scene
 from csplat_tools.views import Split
-
-if TYPE_CHECKING:
-    pass
-
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
@@ -58,11 +54,12 @@ def compare(
 
     `psnr` is pooled over all pixels of eight 640x480 views around A in front
     of black, or of the given views; at most 99 dB. Compare only values for
-    the same cameras and background. With --data, A and B are also scored
-    against the held-out images. Scenes that do not fit in memory are rendered
-    from the disk. --level applies to B. --backend gpu computes PSNR on a GPU
-    (extra gpu), which may differ in the third decimal. Requires the render
-    extra.
+    the same cameras and background. With --cameras or --data, views between,
+    beside and beyond the cameras are scored, too, if the scenes fit in memory.
+    With --data, A and B are also scored against the held-out images. Scenes
+    that do not fit in memory are rendered from the disk. --level applies to B.
+    --backend gpu computes PSNR on a GPU (extra gpu), which may differ in the
+    third decimal. Requires the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat

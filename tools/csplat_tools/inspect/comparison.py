@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -38,7 +38,7 @@ from csplat_render.scorer import OnView, Renderable, Scorer
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
 from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
-from csplat_tools.views import Colour, ViewSet, find_view_set
+from csplat_tools.views import VIRTUAL, Colour, ViewSet, find_view_set, views_off_path
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
@@ -87,6 +87,8 @@ class Comparison:
         attributes: errors of B's splats; `None` if pairs of splats cannot be found, which is usual out of core without
             a source index.
         quality: scores of B's renders against A's.
+        elsewhere: PSNR of B's renders against A's in views off the path of given cameras, dB, by kind
+            (`views_off_path`); empty with virtual views and out of core.
         ignored: number of splats of A that were not drawn because they hold NaN or infinities.
         cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
         image_scores: scores of A's and B's renders against the images of a data set, as JSON of `Scores`, by the
@@ -100,6 +102,7 @@ class Comparison:
     b: Scene
     attributes: AttributeErrors | None
     quality: Scores
+    elsewhere: dict[str, float]
     ignored: int
     cameras: str
     image_scores: dict[str, Any] | None
@@ -128,6 +131,7 @@ class Comparison:
             "mode": self.mode,
             "images": self.image_scores,
             **self.quality.as_json(),
+            "elsewhere": {kind: finite_or_none(psnr) for kind, psnr in self.elsewhere.items()},
             "ignored": {"a": self.ignored, "b": self.quality.ignored},
             "views": [
                 {name: getattr(score, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
@@ -213,8 +217,11 @@ def compare(
             scorer = views.test_scorer(first, mode=mode, background=background, context=context)
             quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
             ignored = scorer.reference(0).ignored
+        elsewhere = {}
+        if views.name != VIRTUAL and source.in_memory is not None and other.in_memory is not None:
+            elsewhere = _psnr_off_path(source.in_memory, first, second, views, background, mode, context)
         return Comparison(
-            source, other, errors, quality, ignored, views.name,
+            source, other, errors, quality, elsewhere, ignored, views.name,
             None if image_scores is None else {"split": views.split, **image_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
@@ -378,6 +385,34 @@ def _prepare_scenes(
         "scenes are rendered: TMPDIR sets another folder",
     )
     return first, second, attribute_errors_out_of_core(source, other, memory_bytes, source_index, context=context)
+
+
+def _psnr_off_path(
+    source: SplatModel,
+    first: SplatModel | Renderable,
+    second: SplatModel | Renderable,
+    views: ViewSet,
+    background: Colour | None,
+    mode: Mode,
+    context: Context,
+) -> dict[str, float]:
+    """Return the PSNR in views off the path of the cameras, dB, by kind.
+
+    Args:
+        source: scene A in memory.
+        first, second: A and B in a form to render, both for a GPU or neither.
+        views, background, mode, context: as for `compare`.
+    """
+    quiet, found = replace(context, progress=null_progress), dict[str, float]()
+    path = () if views.virtual else [*views.training, *views.validation]
+    for kind, cameras in views_off_path(source, views.test, path).items():
+        if isinstance(first, GpuScene) and isinstance(second, GpuScene):
+            quality = compare_scenes(first, second, cameras, background or views.test_background)
+        else:
+            shown = replace(views, training=(), validation=(), test=cameras, images=())
+            quality = shown.test_scorer(first, mode=mode, background=background, context=quiet).scores(second)
+        found[kind] = quality.psnr
+    return found
 
 
 def _on_gpu(scene: SplatModel | Renderable, device: Device) -> GpuScene:

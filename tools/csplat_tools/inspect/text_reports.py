@@ -39,6 +39,9 @@ _SCORE_EXPLANATIONS = {
     "psnr_covered": "of pixels that show more than the background",
     "ssim": "structural similarity, 1 at best",
     "lpips": "perceptual distance by a trained network, 0 at best",
+    "psnr_between": "PSNR of views halfway between cameras",
+    "psnr_beside": "of views turned by up to 15 degrees, to the sides, up and down",
+    "psnr_beyond": "of views up to 1.5 times as far away",
     "cover": "fraction of the pixels that show more than the background",
 }
 _GROUPS = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
@@ -95,6 +98,7 @@ def _scores(compared: Comparison) -> str:
         "psnr_mean": f"{quality.psnr_mean:.2f} dB",
         "psnr_worst": f"{quality.psnr_worst:.2f} dB",
         "psnr_covered": None if quality.psnr_covered is None else f"{quality.psnr_covered:.2f} dB",
+        **{f"psnr_{kind}": f"{psnr:.2f} dB" for kind, psnr in compared.elsewhere.items()},
         "ssim": None if quality.ssim is None else f"{quality.ssim:.5f}",
         "lpips": None if quality.lpips is None else f"{quality.lpips:.5f}",
         "cover": None if quality.cover is None else f"{100.0 * quality.cover:.1f} %",

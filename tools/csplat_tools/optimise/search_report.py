@@ -15,7 +15,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Candidate, CandidatePool
-from csplat_tools.views import describe_views
+from csplat_tools.views import VIRTUAL, describe_views
 
 _NOTABLE = 0.5  # dB; more above the target is explained, and less on other views is pointed out
 
@@ -40,7 +40,9 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
     lines += [f"chosen: {line}" for line in report.why]
     if report.psnr is not None:
         lines.append(f"PSNR {report.psnr:.2f} dB on the test views, {report.sure}")
-        lines += _format_elsewhere(report.psnr, report.elsewhere)
+        is_virtual = report.views_of == VIRTUAL
+        views = "virtual views that were not used in the search" if is_virtual else "views off the path of the cameras"
+        lines += _format_elsewhere(report.psnr, report.elsewhere, views)
     cost = f"{counted(report.encodes, 'file')} tried"
     if report.renders:
         cost += f", {counted(report.renders, 'render')} scored"
@@ -51,15 +53,14 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
     return (*lines, cost)
 
 
-def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float]) -> list[str]:
+def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float], views: str) -> list[str]:
     """Return a line on the PSNR by kind of other views, compared with `psnr` on test views; no line without any."""
     if not elsewhere:
         return []
-    kinds = {"beside": "at other positions"}
-    scores = ", ".join(f"{score:.2f} {kinds.get(kind, kind)}" for kind, score in elsewhere.items())
+    scores = ", ".join(f"{score:.2f} {kind}" for kind, score in elsewhere.items())
     less = psnr - min(elsewhere.values())
     worse = f": up to {less:.1f} dB less than on the test views" if less > _NOTABLE else ""
-    return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
+    return [f"PSNR on {views}: {scores}{worse}"]
 
 
 def make_report(

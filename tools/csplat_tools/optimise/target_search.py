@@ -73,7 +73,7 @@ from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.scene_sensitivity import MANY_SPLATS
-from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
+from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, views_off_path, with_validation_views
 
 # Typical values.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
@@ -819,11 +819,14 @@ def _is_empty(scorer: Scorer) -> bool:
 
 def _psnr_elsewhere(source: SplatModel, chosen: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
     """Return the PSNR on views that were not used in the search, dB to three decimals, by kind."""
-    model, groups = decode(chosen.result.data), extra_test_cameras(source).items()
-    quiet = replace(context, progress=null_progress)
+    model, quiet = decode(chosen.result.data), replace(context, progress=null_progress)
+    if views.name == VIRTUAL:
+        groups = extra_test_cameras(source)
+    else:
+        groups = views_off_path(source, views.test, [*views.training, *views.validation] * (not views.virtual))
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, context=quiet).psnr(model), 3)
-        for kind, cameras in groups
+        for kind, cameras in groups.items()
     }
 
 

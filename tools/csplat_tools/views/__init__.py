@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from csplat_tools.views.off_path_views import views_off_path
 from csplat_tools.views.view_sets import (
     BLACK,
     SPLITS,
@@ -51,5 +52,6 @@ __all__ = [
     "extra_test_cameras",
     "find_view_set",
     "shrink_cameras",
+    "views_off_path",
     "with_validation_views",
 ]
