@@ -44,7 +44,7 @@ _BRIEF, _WHOLE = 0.25, 2.0  # multiples of `_STEPS`: the refits before splats ar
 #: Refits that settle the number of splats: steps as a multiple of `_STEPS`, dB by which the refits that follow are
 #: expected to reduce the error, and number of splats as a multiple of the expected number. Splats that are pruned in
 #: between, by errors of refitted values, leave 0.2 to 0.9 dB more in four scenes than splats that are pruned at once.
-REFITS = ((_BRIEF, 4.0, 1.6), (_BRIEF, 3.3, 1.25), (_WHOLE, 0.1, 1.0), (0.5, 0.0, 1.0))
+REFITS = ((_BRIEF, 3.0, 1.6), (_BRIEF, 2.5, 1.25), (_WHOLE, 0.1, 1.0), (0.5, 0.0, 1.0))
 # dB by which a refit at least reduces the sum of pruning errors, which is less than the error of pruning all at once.
 REFIT_GAIN = 2.0
 
@@ -72,6 +72,7 @@ class Pruner:
     use_classes: bool = True
     context: Context = DEFAULT_CONTEXT
     _last: PrunedSubset | None = field(default=None, init=False)
+    _to_order: SplatModel | None = field(default=None, init=False)
 
     @cached_property
     def sufficient(self) -> SufficientViews:
@@ -154,14 +155,15 @@ class Pruner:
     def refit(self, kept_count: int, part: float = _WHOLE) -> PrunedSubset:
         """Return the kept splats, refitted to renders of the source, unless that makes held-out views worse.
 
-        A refit starts from the values that the previous call returned, so the result depends on earlier calls. After a
-        brief refit, the pruning order continues with its values. Nothing is refitted if all splats are kept or `refits`
-        is False.
+        A refit starts from the values that the previous call returned, and the pruning order continues with them, so
+        the result depends on earlier calls. Nothing is refitted if all splats are kept or `refits` is False.
 
         Args:
             kept_count: number of splats to keep.
             part: number of steps as a multiple of the usual number.
         """
+        if self._to_order is not None and kept_count < len(self._to_order):
+            self.order.continue_with(self._to_order)
         rows = self.order.kept(kept_count)
         pruned = self.source.select(rows)
         psnr_pruned = self.check_scorer.psnr(pruned)
@@ -179,6 +181,8 @@ class Pruner:
         is_refused = psnr_refitted < psnr_pruned
         model, psnr = (pruned, psnr_pruned) if is_refused else (refitted, psnr_refitted)
         self._last = PrunedSubset(self, model, rows, psnr_pruned, psnr, is_refused)
+        # The errors of well-fitted splats predict those of fewer splats too low, so they only choose which to prune.
+        self._to_order = model if part == _WHOLE else None
         if part == _BRIEF:
             self.order.continue_with(model)
         return self._last

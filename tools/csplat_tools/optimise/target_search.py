@@ -485,7 +485,8 @@ class TargetSearch:
             if quality is None:
                 return is_met
             if self.goal.size_bytes is None:
-                smaller = [file for file in self.pool.made if math.log(file.size_bytes) < line.log_bytes_at(quality)]
+                others = [file for file in self.pool.made if (file.subset, file.coding) != (subset, coding)]
+                smaller = [file for file in others if math.log(file.size_bytes) < line.log_bytes_at(quality)]
                 if any(self._is_met(file) for file in smaller):  # other splats or another coding cost less
                     return True
             finest = max((file.quality or 0.0 for file in made), default=math.inf)
