@@ -5,18 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
+from csplat_bench.published import PUBLISHED, read_published
 from csplat_bench.suites import Case, Suite
 from csplat_tools.optional_packages import describe_machine
-
-#: Folder of published figures.
-PUBLISHED = Path(__file__).resolve().parent.parent / "published"
 
 _DIGITS = 6  # significant digits of numbers in results
 
@@ -83,15 +80,15 @@ class Results:
         Args:
             name: name of a TOML file in `published`, whose keys are scenes, or how they begin, and sets.
         """
-        tables = tomllib.loads((PUBLISHED / f"{name}.toml").read_text("utf-8"))
+        published = read_published(PUBLISHED / f"{name}.toml")
         rows = [row for row in self.rows if "published" not in row]
         scenes = list(dict.fromkeys(row["scene"] for row in rows))
         sets = dict.fromkeys(row["set"] for row in rows if "set" in row)
-        found = [
-            *((scene, key) for scene in scenes for key in tables if key not in sets and scene.startswith(key)),
-            *((f"all of {key}", key) for key in sets if key in tables),
-        ]
-        rows += [{"scene": scene, **row} for scene, key in found for row in tables[key]]
+        rows += [
+            *({**row, "scene": scene} for scene in scenes for row in published
+              if row["scene"] not in sets and scene.startswith(row["scene"])),
+            *({**row, "scene": f"all of {key}"} for key in sets for row in published if row["scene"] == key),
+        ]  # fmt: skip
         self.document["rows"] = rows
         self.write()
 

@@ -2,7 +2,7 @@
 
 A template is a format string over the fields of a row, such as `{size_bytes / 1e6:.2f}` or `{psnr - source.psnr:+.1f}`.
 Fields and numbers may be joined by ` / `, ` * ` and ` - `, which are evaluated from left to right. A field of a nested
-record is called `outer.inner`.
+record is called `outer.inner`. A column may have several templates: the first whose fields are all there is shown.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from typing import Any
 
 from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
+from csplat_bench.published import read_published
 
 MISSING = "–"  # cell of a template with a field that is absent or null
 
 Row = Mapping[str, Any]
-#: Heading and template; or `key`, with `title`, `scale` (1) and `format`.
+#: Heading and templates; or `key`, with `title`, `scale` (1) and `format`.
 Column = Sequence[str] | Mapping[str, Any]
 
 # Okabe and Ito's colours, which readers with any colour vision can tell apart.
@@ -68,37 +69,50 @@ def markdown_table(rows: Iterable[Row], columns: Sequence[Column], labels: Mappi
         columns: what each shows.
         labels: texts that replace whole cells.
     """
-    labels, pairs = labels or {}, [_heading_and_template(column) for column in columns]
+    labels, pairs = labels or {}, [_heading_and_templates(column) for column in columns]
     lines = [[heading for heading, _ in pairs], ["---"] * len(pairs)]
     for row in map(flatten, rows):
-        cells = [cell(template, row) for _, template in pairs]
+        cells = [_first_cell(templates, row) for _, templates in pairs]
         lines.append([labels.get(text, text) for text in cells])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _heading_and_template(column: Column) -> tuple[str, str]:
+def _heading_and_templates(column: Column) -> tuple[str, Sequence[str]]:
     if not isinstance(column, Mapping):
-        heading, template = column
-        return heading, template
+        heading, *templates = column
+        return heading, templates
     key, scale = column["key"], f" * {column['scale']}" if "scale" in column else ""
-    return column.get("title", key), f"{{{key}{scale}:{column.get('format', '')}}}"
+    return column.get("title", key), [f"{{{key}{scale}:{column.get('format', '')}}}"]
+
+
+def _first_cell(templates: Iterable[str], row: Row) -> str:
+    texts = (cell(template, row) for template in templates)
+    return next((text for text in texts if text != MISSING), MISSING)
 
 
 def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     """Read the rows that a table or plot shows.
 
     Args:
-        spec: `source`, one or more JSON files. Optional keys: `rows`, the key of the list in them, or "." for a single
-            row with the file's own fields; `where`, allowed values by field, which also give the order; `group` and
-            `by`: rows with equal fields `group` are merged into one, and the other fields of a row with `by = VALUE`
-            are renamed to `VALUE.FIELD`. A row without `series` gets its `case`.
+        spec: `source`, one or more files: JSON, or TOML of published figures, which replace those in the JSON files.
+            Optional keys: `rows`, the key of the list in a JSON file, or "." for a single row with the file's own
+            fields; `where`, allowed values by field, which also give the order; `group` and `by`: rows with equal
+            fields `group` are merged into one, and the other fields of a row with `by = VALUE` are renamed to
+            `VALUE.FIELD`. A row without `series` gets its `case`. If there are published figures, a measured row gets
+            `source_psnr`, the PSNR of the row of its scene whose `case` is `trained`, and the fields that it lacks of
+            `fill`, templates by field.
         folder: folder of the JSON files.
 
     Raises:
         ValueError: no row is left.
     """
-    key = spec.get("rows", "rows")
-    rows: list[Row] = [flatten(row) for name in _as_list(spec["source"]) for row in _read(folder / name, key)]
+    files = [folder / name for name in _as_list(spec["source"])]
+    published = [row for file in files if file.suffix == ".toml" for row in read_published(file)]
+    rows: list[Row]
+    rows = [flatten(row) for file in files if file.suffix != ".toml" for row in _read(file, spec.get("rows", "rows"))]
+    if published:
+        measured = [row for row in rows if "published" not in row]
+        rows = [*_completed(measured, spec.get("trained"), spec.get("fill", {})), *published]
     rows = [{"series": row["case"], **row} if "case" in row else row for row in rows]
     for field, values in reversed(spec.get("where", {}).items()):
         order = {value: position for position, value in enumerate(_as_list(values))}
@@ -108,6 +122,13 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     if not rows:
         raise ValueError(f"{spec['source']}: no row is left, expected some with {spec.get('where', {})}")
     return rows
+
+
+def _completed(rows: Sequence[Row], trained: str | None, fill: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+    sources = {row["scene"]: row["psnr_mean"] for row in rows if row.get("case") == trained}
+    for row in rows:
+        found = {"source_psnr": sources.get(row.get("scene")), **row}
+        yield {**{name: cell(template, row) for name, template in fill.items()}, **found}
 
 
 def flatten(row: Row, prefix: str = "") -> dict[str, Any]:
@@ -150,9 +171,9 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
         rows: records of results.
         spec: `x`, `y` and `series`, fields or arithmetic over them. Optional keys: `per`, a field with a panel for each
             value, `columns` panels in a row; `note`, a field whose text is shown next to a point; `styles`, colour and
-            matplotlib's format by series; `labels` of series; `x_title`, `y_title`, `x_scale` (log or linear), `ticks`,
-            `x_limits`, `y_limits`, `size` in inches.
-        path: the file, which is replaced.
+            matplotlib's format by series; `labels` of series and panels; `x_title`, `y_title`, `x_scale` (log or
+            linear), `ticks`, `x_limits`, `y_limits`, `size` in inches.
+        path: the file, which is replaced. A panel's legend shows the series that are not in an earlier one.
 
     Raises:
         InputError: there are no rows.
@@ -173,12 +194,16 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
         grid = figure.subplots(-(-len(panels) // across), across, squeeze=False)
         for axis in grid.flat[len(panels) :]:
             axis.set_visible(False)
+        known: set[str] = set()
         for axis, panel in zip(grid.flat, panels, strict=False):
             _draw_panel(axis, spec, [row for row in rows if _value(spec.get("per"), row) == panel])
-            axis.set_title(panel, fontsize=9)
+            axis.set_title(spec.get("labels", {}).get(panel, panel), fontsize=9)
+            lines = [line for line in axis.get_lines() if line.get_label() not in known]
+            known.update(line.get_label() for line in lines)
+            if lines:
+                axis.legend(handles=lines, frameon=False, fontsize=8, loc="lower right")
         figure.supxlabel(spec.get("x_title", spec["x"]), fontsize=9)
         figure.supylabel(spec.get("y_title", spec["y"]), fontsize=9)
-        grid.flat[0].legend(frameon=False, fontsize=8, loc="lower right")
         figure.savefig(buffer, format="svg", dpi=100, metadata={"Date": None, "Source": digest(spec, rows)})
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(path) as stream:

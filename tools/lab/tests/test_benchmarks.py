@@ -30,6 +30,7 @@ from csplat_bench import data_set_folders, results
 from csplat_bench.__main__ import main
 from csplat_bench.made_scenes import crowd, split
 from csplat_bench.protocol import AbsentError, Setup
+from csplat_bench.published import PUBLISHED, read_published
 from csplat_bench.results import Results
 from csplat_bench.rules import bytes_at, mark_beaten, mean_rows, size_ratios, summarise_turns
 from csplat_bench.runner import run_suite
@@ -37,6 +38,7 @@ from csplat_bench.slow_line import Line
 from csplat_bench.subjects import SUBJECTS
 from csplat_bench.subjects.arrival import Record
 from csplat_bench.suites import Case, Suite, load_suite, suite_names
+from csplat_bench.tables import markdown_table, select_rows
 from csplat_render import render
 from csplat_render.virtual_cameras import virtual_cameras
 
@@ -318,13 +320,37 @@ def test_a_mean_requires_a_value_of_every_scene():
 
 def test_published_figures_of_scenes_give_the_published_means():
     """A slip of a digit shows: papers print figures by scene and their means."""
-    tables = tomllib.loads((results.PUBLISHED / "captures.toml").read_text())
+    tables = tomllib.loads((PUBLISHED / "captures.toml").read_text())
     for protocol in data_set_folders.PROTOCOLS:
         scenes = [tables[f"{protocol.slug}-{scene}"][0] for scene in protocol.factors]
         printed, tolerances = tables[protocol.slug][0], {"psnr_mean": 0.01, "ssim": 0.0006, "lpips_vgg": 0.0006}
         for key, tolerance in tolerances.items():
             if key in printed:
                 assert printed[key] == pytest.approx(np.mean([one[key] for one in scenes]), abs=tolerance)
+
+
+def test_published_means_of_curves_are_those_of_the_scenes():
+    rows = [row for row in read_published(PUBLISHED / "methods.toml") if row["case"].startswith(("KISS", "FCGS"))]
+    means = {(row["scene"], row["case"], row.get("tier")): row for row in rows if "-" not in row["scene"]}
+    assert 4 * 7 + 3 * 2 == len(means)
+    for (name, *kind), mean in means.items():
+        scenes = [row for row in rows if row["scene"].startswith(f"{name}-") and [row["case"], row.get("tier")] == kind]
+        for key in ("size_bytes", "psnr_mean", "ssim", "lpips_vgg"):
+            assert mean[key] == pytest.approx(np.mean([row[key] for row in scenes]), rel=1e-4)
+
+
+def test_results_are_shown_next_to_published_figures(tmp_path):
+    measured = [{"scene": "a", "case": "PLY", "psnr_mean": 30.0}, {"scene": "a", "case": "1 MB", "psnr_mean": 29.0}]
+    copied = {"scene": "a", "case": "X", "psnr_mean": 1.0, "published": "p"}
+    (tmp_path / "r.json").write_text(json.dumps({"rows": [*measured, copied]}))
+    head = '[[methods]]\ncase = "X"\nnetwork = true\npublished = "p"\nfields = ["psnr_mean"]\n'
+    (tmp_path / "p.toml").write_text(f"{head}[methods.rows]\na = [[28.5]]\n")
+    spec = {
+        "source": ["r.json", "p.toml"], "trained": "PLY", "fill": {"network": "no"}, "where": {"case": ["X", "1 MB"]}
+    }  # fmt: skip
+    columns = [["", "{psnr_mean}"], ["", "{source_psnr} dB", "as {published}"], ["", "{network}"]]
+    table = markdown_table(select_rows(spec, tmp_path), columns, {"True": "yes"})
+    assert ["| 28.5 | as p | yes |", "| 29.0 | 30.0 dB | no |"] == table.split("\n")[2:]
 
 
 def test_published_rows_follow_the_scenes_and_sets_that_were_measured(tmp_path):
