@@ -141,9 +141,14 @@ class Pruner:
         errors = self.order.mean_errors()
         return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), NOTHING)
 
-    def turn(self, number: int) -> tuple[float, float, float]:
-        """Return the entry of `REFITS` for a refit after a number of others; the last one if there are no refits."""
-        return REFITS[min(number, len(REFITS) - 1)] if self.refits else REFITS[-1]
+    def turn(self, number: int, *, is_far: bool = False) -> tuple[float, float, float]:
+        """Return the entry of `REFITS` for a refit after a number of others; the last one if there are no refits.
+
+        Corrections have twice the steps if the number of splats `is_far` from that of the last refit.
+        """
+        last = len(REFITS) - 1
+        part, rest_gain, surplus = REFITS[min(number, last) if self.refits else last]
+        return (2.0 * part if is_far and number >= last else part), rest_gain, surplus
 
     def refit_in_rounds(self, kept_count: int) -> PrunedSubset:
         """Return the kept splats, refitted as by `refit`, after brief refits of more splats."""

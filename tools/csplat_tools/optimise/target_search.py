@@ -87,6 +87,8 @@ _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the q
 _QUALITIES = (24.0, 80.0)  # range of the precision, PSNR of each attribute alone, dB
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
+_FAR_COUNT = 0.05  # relative difference of two numbers of splats from which on a correction has more steps
+_LOWER = 2  # most further refits while the number of splats falls by more than that
 _FEW = 3  # most drafts of one coding, files that miss narrowly, and files with levels of detail
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
@@ -236,12 +238,13 @@ class TargetSearch:
     def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding]:
         """Return the best number of splats by the model, refitted, and their best coding. Add drafts to the pool.
 
-        Brief refits correct the prediction of the pruning order, and the whole refit corrects theirs.
+        Brief refits correct the prediction of the pruning order, and the whole refit corrects theirs. Each refit may
+        show that even fewer splats suffice.
         """
-        kept_count, turn = self._best_count(pruner), 0
+        kept_count, turn, is_far = self._best_count(pruner), 0, False
         costs, errors = dict[int, float](), dict[int, float]()  # by number of splats: of drafts, and of pruning
         while True:
-            part, rest_gain, surplus = pruner.turn(turn)
+            part, rest_gain, surplus = pruner.turn(turn, is_far=is_far)
             count, turn = self._rounded(surplus * kept_count), turn + 1
             subset, coding = pruner.refit(count, part), None
             if self.goal.size_bytes is not None or self.goal.images is not None:  # what files of the goal are like
@@ -258,7 +261,9 @@ class TargetSearch:
             is_near = abs(kept_count - count) <= _WORTH * kept_count
             is_whole = is_settled or len(subset.model) == len(self.whole.model)
             takes_too_much = errors.get(count, 0.0) > self._most_left_out * self._allowed
-            if (is_near and is_whole) or turn >= len(REFITS) + _FEW * takes_too_much:
+            is_far = abs(kept_count - count) > _FAR_COUNT * count
+            further = _FEW if takes_too_much else _LOWER * (is_far and kept_count < count)
+            if (is_near and is_whole) or turn >= len(REFITS) + further:
                 return subset, self._choose_coding(subset, self._most_codings(subset))
 
     def _between(self, errors: Mapping[int, float], proposed: int) -> int:
