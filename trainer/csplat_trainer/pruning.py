@@ -27,7 +27,8 @@ ROUND_FRACTION = 0.72
 
 _UNDRAWN_KEY, _UNSEEN_KEY = -1.0, -0.5  # keys of splats to prune before all others, in this order
 _F16_MAX = float(np.finfo(np.float16).max)
-_GROUPS_AGAIN = 2  # groups of views in which refitted splats are measured; with all, PSNR rises by less than 0.1 dB
+# Views in which refitted splats are measured, if there are more; with twice as many, PSNR rises by less than 0.1 dB.
+_VIEWS_AGAIN = 100
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -148,7 +149,9 @@ class PruningOrder:
         self.rows, self.errors = self.rows[:pruned_count], self.errors[:pruned_count]
         ends = np.minimum(np.cumsum(self.rounds), pruned_count)
         self.rounds = [int(count) for count in np.diff(ends, prepend=0) if count]
-        self.groups = [self._measured(refitted, group.cameras) for group in self.groups[:_GROUPS_AGAIN]]
+        before = np.cumsum([0, *(len(group.cameras) for group in self.groups[:-1])])
+        needed = [group for group, views in zip(self.groups, before, strict=True) if views < _VIEWS_AGAIN]
+        self.groups = [self._measured(refitted, group.cameras) for group in needed]
         self._is_measured = True
 
     def _measured(self, left: SplatModel, cameras: Sequence[Camera]) -> MeasuredViews:
