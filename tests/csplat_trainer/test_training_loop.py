@@ -217,7 +217,7 @@ def test_one_training_gives_several_files(file_runs):
     assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
     wanted = usual["validation"]["psnr"] - 0.25  # of twenty splats, nearer goals are out of reach
     good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
-    assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.15
+    assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.05
     assert trained == file_runs.checkpoint.read_bytes()
 
 

@@ -113,9 +113,7 @@ def test_a_size_or_a_psnr_drop_against_images_is_met_with_fewer_splats(many, sea
     assert report.images["source"] < 28.0
     assert report.images["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
     assert report.images["file"] >= report.images["source"] - 1.0  # the validation images decide
-    assert (
-        scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.2
-    )  # of a few hundred splats, which jumps
+    assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
     assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
     assert search_at_size.report.search.psnr > 24.0
     for found in (report, search_at_size.report.search):
@@ -142,7 +140,7 @@ def test_extreme_scenes_meet_a_psnr(name):
     views = judged_by(cameras(40)) if name == "one splat" else around(source)
     decoded = decode(found_within(source, views, psnr=17.0).data)
     assert with_validation_views(views).validation_scorer(source).psnr(decoded) >= 17.0
-    assert views.test_scorer(source).psnr(decoded) >= 16.5  # the validation views decide
+    assert views.test_scorer(source).psnr(decoded) >= 16.8  # the validation views decide
     assert len(decoded) >= 1
 
 

@@ -43,7 +43,7 @@ _STEPS = 640  # usual steps of a refit from tuned values, and of the first refit
 _BRIEF, _WHOLE = 0.25, 2.0  # multiples of `_STEPS`: the refits before splats are pruned further, and a whole refit
 #: Refits that settle the number of splats: steps as a multiple of `_STEPS`, dB by which the refits that follow are
 #: expected to reduce the error, and number of splats as a multiple of the expected number. Splats that are pruned in
-#: between, by errors of refitted values, leave 0.2 to 0.9 dB more in four scenes than splats that are pruned at once.
+#: between, by errors of refitted values, leave 0.5 to 1.2 dB more in three scenes than splats that are pruned at once.
 REFITS = ((_BRIEF, 3.0, 1.6), (_BRIEF, 2.5, 1.25), (_WHOLE, 0.1, 1.0), (0.5, 0.0, 1.0))
 # dB by which a refit at least reduces the sum of pruning errors, which is less than the error of pruning all at once.
 REFIT_GAIN = 2.0
