@@ -31,7 +31,7 @@ from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import parse_max_error
-from csplat_tools.optimise.candidates import CandidatePool, WholeScene, complete_importance
+from csplat_tools.optimise.candidates import CandidatePool, Coding, WholeScene, complete_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.scene_sensitivity import measure_importance
@@ -171,6 +171,44 @@ def test_a_refit_through_the_quantisers_improves_test_views(scene):
     part, judge = removal.refit(300), views.test_scorer(bare)
     quick, fitted = (part.encode(coarse, use_classes=False, draft=draft).write().data for draft in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
+
+
+class ErrorsInTurn:
+    """A scorer that returns errors of a few views, first for the splats before a refit, then for those after it."""
+
+    def __init__(self, *errors):
+        self._errors = iter(errors)
+
+    def errors(self, _model):
+        return np.array(next(self._errors))
+
+
+@pytest.mark.slow
+def test_a_refit_through_the_quantisers_is_kept_if_most_held_out_views_gain(scene):
+    views = with_validation_views(judged_by(cameras(40)))
+    before, coarse = [2.0, 2.0, 2.0, 2.0], EncodeOptions(opacity_levels=8, scale_step=0.3)
+
+    def encoded(after):
+        pruner = SimplifyOptions(effort=1).pruner(scene, views)
+        part = pruner.refit(200)
+        pruner.check_scorer = ErrorsInTurn(before, after)
+        return part.encode(coarse, use_classes=False, draft=False).write().data
+
+    half_gain, one_loses, most_lose = (encoded(after) for after in ([1, 1, 3, 9], [1, 1, 1, 99], [1, 3, 3, 3]))
+    assert half_gain == one_loses != most_lose
+
+
+@pytest.mark.slow
+def test_the_error_of_the_first_draft_is_measured_and_corrects_others(scene):
+    scorer = with_validation_views(judged_by(cameras(40))).validation_scorer(scene)
+    pool, whole = CandidatePool(EncodeOptions(), scorer), WholeScene(scene, None, None, Context())
+    pool.error(replace(scene, opacities=0.99 * scene.opacities), exact=True)  # an error with another ratio
+    first, second = (pool.make(whole, Coding(use_classes=False), quality, draft=True) for quality in (30.0, 31.0))
+    assert first.is_exact
+    assert not second.is_exact
+    estimated = second.error
+    pool.measure(second)
+    assert estimated == pytest.approx(second.error, rel=0.05)
 
 
 def test_a_refit_predicts_the_error_of_others():

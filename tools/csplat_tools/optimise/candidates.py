@@ -277,9 +277,11 @@ class CandidatePool:
             subset: its splats.
             coding: the coding of their colours.
             quality: PSNR of each attribute alone, dB; `None`: the precision of the options.
-            draft: skip the refit through the quantisers, if the subset has such a refit, and estimate the error.
+            draft: skip the refit through the quantisers, if the subset has such a refit, and estimate the error, unless
+                it is the first candidate of its splats: errors of quantisation and of pruning have different ratios.
         """
-        options, exact = coding.options(self.encoding, len(subset.model), quality), not draft
+        options = coding.options(self.encoding, len(subset.model), quality)
+        exact = not draft or all(candidate.subset is not subset for candidate in self.made)
         draft = draft and subset.refits
         for candidate in self.made:
             is_alike = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes

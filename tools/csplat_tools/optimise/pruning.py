@@ -194,7 +194,7 @@ class Pruner:
 
     def planned_steps(self, files: float) -> tuple[float, float]:
         """Return the numbers of steps of the refits of a search, and those through the quantisers of some files."""
-        later = _STEPS // (2 if self.use_classes else 1)
+        later = _STEPS // (2 if self.use_classes and not self.source.sh_degree else 1)
         return (
             sum(self.scaled_steps(part * _STEPS) for part, *_ in REFITS),
             self.scaled_steps(_STEPS) + (files - 1.0) * self.scaled_steps(later),
@@ -252,19 +252,21 @@ class PrunedSubset:
             before=self.model, background=pruner.views.background, context=pruner.context,
         )  # fmt: skip
         start = fixed.start()
-        psnr_start, psnr_refit = (pruner.check_scorer.psnr(self._decoded(fixed, tried)) for tried in (start, values))
-        values = values if psnr_refit >= psnr_start else start  # a refit of few splats may overfit
-        # Longer chains overfit, and in surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less).
-        if tuned is None and pruner.use_classes:
+        errors_start, errors = (pruner.check_scorer.errors(self._decoded(fixed, tried)) for tried in (start, values))
+        if np.mean(errors > errors_start) > 0.5:  # refits of few splats may overfit; single views say little
+            values = start
+        # Longer chains overfit. In surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less), and
+        # from values with entries of another codebook, later files gain a third as much.
+        if tuned is None and pruner.use_classes and fixed.book is None:
             self._tuned[kind] = self._with_values(fixed, values)
         return fixed.encode(values)
 
     def _with_values(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
-        """Return the splats with tuned values before rounding, or decoded values if splats share them."""
-        decoded, here = fixed.dequantise(values), np.argsort(fixed.source_index)
-        shape = decoded if fixed.shapes is not None else values
+        """Return the splats with tuned values before rounding, or decoded shapes if splats share them."""
+        here = np.argsort(fixed.source_index)
+        shape = fixed.dequantise(values) if fixed.shapes is not None else values
         shN = np.zeros_like(self.model.shN)
-        shN[:, : decoded.shN.shape[1]] = (decoded.shN if fixed.book is not None else values.sh)[here]
+        shN[:, : values.sh.shape[1]] = values.sh[here]
         return replace(
             self.model, opacities=values.opacities[here], quats=shape.quats[here], scales=shape.scales[here],
             sh0=values.sh0[here], shN=shN,
