@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build the documentation site: collect its pages from the repository, then run MkDocs.
 
 A page is a Markdown file of the repository or generated. Links between files become links between pages, so any site
