@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # The tiers of tests; `make check`, `make test`, `make lab-test` and `make test-all` set up .venv and call this.
 #
 #   tests/run.sh check   the checkout: style, types, import contracts, generated files, unmarked tests; half a minute

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Entry point of the installed script `csplat`: ends silently at an interrupt while the program loads.
 
 A module of its own, since importing any part of a package imports the package first, which takes 50 ms.

@@ -1,8 +1,9 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* csplat.h documents the interface, spec/format.md the format. Names of clauses, such as [HDR-1], are the specification's.
  *
  * In this order: bytes and errors, chunks, streams (6.1 to 6.3), header and index (4), codebooks (5.3), blocks (6.4),
  * values (7), texts (5.4), nodes and cuts (5.7), the public functions. No two floating-point operations are combined such
- * that a compiler could contract them. SPDX-License-Identifier: Apache-2.0 */
+ * that a compiler could contract them. */
 #include "csplat.h"
 
 #include <float.h>

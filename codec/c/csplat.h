@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A decoder for .csplat, a compressed format for 3D Gaussian splats (spec/format.md).
  *
  *     csplat *file;
@@ -15,7 +16,7 @@
  *
  * There is no global state. A csplat belongs to one thread at a time; threads can each open one on the same bytes.
  * Every function that can fail returns CSPLAT_OK, which is 0, or the code of the specification. After a failure the
- * csplat can still be used. SPDX-License-Identifier: Apache-2.0 */
+ * csplat can still be used. */
 #ifndef CSPLAT_H
 #define CSPLAT_H
 

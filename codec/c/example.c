@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* cc csplat.c example.c -lz -lm && ./a.out scene.csplat: print the contents of a file, tile by tile. */
 #include "csplat.h"
 

@@ -1,8 +1,8 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* An inflate for programs without zlib (-DCSPLAT_NO_ZLIB): raw DEFLATE (RFC 1951) with the rules of the specification,
  * 6.2. It allocates no memory and accesses no byte outside the two buffers.
  *
- * Codes are decoded with tables: the next ROOT bits index one, which points to smaller tables for longer codewords.
- * SPDX-License-Identifier: Apache-2.0 */
+ * Codes are decoded with tables: the next ROOT bits index one, which points to smaller tables for longer codewords. */
 #include "csplat.h"
 
 #include <string.h>

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """csplat: a compressed format for 3D Gaussian splats.
 
     >>> import csplat

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run `python -m csplat`: the console script `csplat`, which another package provides."""
 
 from __future__ import annotations

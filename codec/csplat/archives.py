@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read NumPy archives (.npz) from untrusted sources, and describe zips and folders that are not scenes."""
 
 from __future__ import annotations

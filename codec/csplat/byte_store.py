@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read byte ranges of files in memory and on disk; base class of the store for URLs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How work runs: threads, worker processes, memory, seed and progress, which travel together."""
 
 from __future__ import annotations

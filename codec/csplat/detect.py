@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identify files: a table of the formats that csplat reads and of other files that users pass by mistake.
 
 Content takes precedence over the file name. Only the first bytes and the names in a zip are examined; nothing is

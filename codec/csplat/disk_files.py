@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read text, JSON and arrays; copy inputs to disk; write files atomically."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a scene in one call: of any size, with the given options or to a target, with or without levels of detail."""
 
 from __future__ import annotations

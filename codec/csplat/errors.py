@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Define the exceptions, with a class per party at fault.
 
 | class | fault | remedy |

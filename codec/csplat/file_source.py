@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Accept input files as paths, binary files or bytes; map files; recognise placeholders such as Git LFS pointers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the value with which a measured result meets a goal, in few measurements.
 
 A result is a function of one number, such as the log error of a file by its precision. It meets the goal if it is at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`open_image`: open a PNG, JPEG, TIFF, WebP or BMP with Pillow. Nothing else in the project opens an image.
 
 Pillow's own `open` tries every plugin that it has, and some of them start other programs: a PostScript file under the

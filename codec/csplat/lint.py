@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Describe findings about splat files: unusual or invalid content and its repair.
 
 A *note* is ordinary variation; nothing is lost or looks different. A *repair* changes or drops data safely; `strict`

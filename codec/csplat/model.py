@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Represent a scene of 3D Gaussian splats in memory: `SplatModel`.
 
 All readers, writers, renderers and the codec use it. The constructor checks its data and never repairs it.

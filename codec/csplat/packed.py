@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Integers of tiles, with codebooks as tables, as a renderer on a GPU keeps them (`SplatFile.packed_tiles`).
 
 A value is an integer times a step (spec 7). An SH band of a tile has a row of integers per splat, or an index per

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Load extensions of the codec from the entry points of installed packages.
 
 | group | entry points |

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compute exponentials and logarithms with the same bits on every processor.
 
 NumPy and the C library choose different code for different processors, with results that differ in the last bit. The

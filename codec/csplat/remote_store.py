@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read byte ranges of files at URLs with fsspec, and choose the store of a file."""
 
 from __future__ import annotations

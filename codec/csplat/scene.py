@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read a scene in blocks of bounded size: `Scene`.
 
 A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, with a single block

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Represent the metadata of a scene: `SceneMetadata`, with its up direction and its training record (spec 5.4)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parse sizes, which options and commands spell alike."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The real spherical-harmonics basis of the colours of splats, with the order and the signs of INRIA, gsplat and SPZ.
 
 With P the associated Legendre functions including the Condon–Shortley phase, the function of degree l and order m is

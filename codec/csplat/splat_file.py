@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read parts of a file on disk, in memory or at a URL: header and index first, then requested parts."""
 
 from __future__ import annotations

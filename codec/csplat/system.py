@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Provide operating-system services on every platform: files, memory, locks, signals and processes.
 
 Checks of `sys.platform` are for type checkers; `hasattr` decides whether a system has a call.

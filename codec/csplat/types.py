@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Define types and a constant that all layers share: arrays by dtype, the progress callback, and the largest PSNR."""
 
 from __future__ import annotations

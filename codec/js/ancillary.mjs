@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The chunks that describe a scene: META, CAMS, OPTS (spec 5.4) and SERR (5.5).
 
 import { fault } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The table of answers: what is done with each answer of an HTTP server to a request for a file, or for a part of it.
 //
 //   status  headers                            verdict

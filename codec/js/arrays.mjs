@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The arrays that a decoder returns, filled tile by tile: floats (spec sections 3 and 7) or integers (9.2).
 
 import { tableValues } from './codebooks.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Assembles decoded layers into the arrays that the caller gets.
 
 import { FloatArrays, IntegerArrays, arrayBytes } from './arrays.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // CRC-32 (spec section 2).
 
 /** Size of a CRC-32 in bytes. */

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Codebooks: their chunks (spec 5.3) and the blocks that refer to them (6.4.5).
 
 import {

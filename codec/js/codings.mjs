@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Attribute codings other than CODEBOOK: from streams to integers (spec section 6.4).
 
 import { fault } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The header of a file (spec 4.2) and the frame of a chunk (5.1).
 
 import { CRC_SIZE, crc32 } from './checksums.mjs';

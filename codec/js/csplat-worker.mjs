@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The code that runs in a worker; workers.mjs runs in the calling thread.
 
 import { buffersOf } from './arrays.mjs';

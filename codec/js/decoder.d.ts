@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types of the csplat decoder. test/types.ts checks decoder.mjs against them.
 
 /** Limits on what a file may require. The defaults are those of the spec, section 8. */

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Decoder of the csplat format, from spec/format.md. No dependencies. Runs in browsers, workers and Node 20.
 //
 //   import { CsplatReader, decode, readHeader } from './decoder.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The errors of a decoder (spec section 12, error codes). Invalid bytes cause no other errors in this package.
 
 import { ERROR_INPUT, ERROR_LIMIT, ERROR_UNSUPPORTED } from './spec.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Extra columns (spec 4.3.3, 6.4.6): carried bit for bit.
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The index (spec 4.3): records of the whole file. `tile_records.mjs` reads the tiles, which follow them.
 
 import { CRC_SIZE } from './checksums.mjs';

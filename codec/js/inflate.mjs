@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Raw DEFLATE (RFC 1951) with the platform's implementation. This module ensures COD-2 and COD-4: the stream ends within
 // the last byte and gives exactly the declared size, and no more output than that is ever produced. zlib, and thus every
 // platform, checks COD-5 to COD-8.

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A strict JSON parser (spec 5.4, JSN-1). JSON.parse is too lenient: it keeps the last of two equal names, turns large
 // numbers into Infinity, accepts lone surrogates and recurses without a limit.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Lattices: exact steps, colour lifting, and the conversion from integers to the arrays (spec 7.1, 7.2).
 
 const ROWS_AT_ONCE = 1024; // rows of shN; keeps the rows that are written column by column in the cache

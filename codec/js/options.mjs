@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Checks of the caller's arguments. Every error here is E_INPUT.
 
 import { InputError } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The form 'packed', for callers that draw or store integers: in the narrowest type of each tile's layer, codebooks as
 // tables.
 

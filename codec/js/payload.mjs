@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Bytes of a file with their offset in it. Every length is checked here before it is used.
 
 import { fault } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Reads tiles and layers of a file one by one in any order, over HTTP Range, from a Blob or from memory.
 //
 // This reader contains two complete decoders: WebAssembly (wasm_decoder.mjs) and JavaScript (tile_blocks.mjs). JavaScript

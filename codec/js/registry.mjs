@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Lookups in the registry.
 
 import * as spec from './spec.mjs';

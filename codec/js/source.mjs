@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Sources of a file that is not in memory: HTTP with Range, or one of those in `whole_sources.mjs`.
 
 import { readFileHeader } from './container.mjs';

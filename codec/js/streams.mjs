@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Streams: head and coder (spec sections 6.1 and 6.2).
 
 import { fault } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Decodes the blocks of one tile's layers to integers and checks them (spec 5.2, 6.4, 7.1, 7.2, 7.4).
 
 import { readCodebookBlock } from './codebooks.mjs';

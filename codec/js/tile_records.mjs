@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Tile and layer records (spec 4.3.5) and the coverage of the file by chunks (4.3.6).
 
 import { fault } from './errors.mjs';

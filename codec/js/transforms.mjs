@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Transforms: from unpacked bytes to integers (spec section 6.3).
 
 import { fault } from './errors.mjs';

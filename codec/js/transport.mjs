@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Requests for one file over HTTP: the only place that fetches, retries, times out and asks for a new address.
 
 import { differ, isCoded, judge } from './answers.mjs';

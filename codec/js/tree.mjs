@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The nodes of the levels of detail and cuts through them (spec 5.7).
 
 import { LimitError, fault } from './errors.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The C decoder compiled to WebAssembly (wasm/, codec/c), for floats and packed arrays. Files that it refuses are decoded
 // again by the JavaScript modules, which report the error and its offset.
 

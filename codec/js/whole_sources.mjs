@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Sources that hold the whole file: a body from a server without ranges, memory, a Blob.
 
 import { replaced } from './answers.mjs';

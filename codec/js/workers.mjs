@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Decodes tiles in workers. csplat-worker.mjs runs in the worker and does not import this module: bundlers would not end.
 
 import { buffersOf } from './arrays.mjs';

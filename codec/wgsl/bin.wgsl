@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Lists the screen tiles of each splat, in the order of depth. A step takes as many blocks of 256 splats as the buffer of
 // pairs holds; the host asks for further steps until all are drawn.
 //

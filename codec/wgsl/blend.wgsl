@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Blends a screen tile of 16 x 16 pixels front to back, in binary32: 64 threads, four pixels of a column each. Pixels go
 // on from what earlier steps left. A finished pixel has its transmittance with the sign reversed.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Shared by all passes: what the host sets for a picture, what the GPU counts, and the constants of the renderer.
 
 struct View {

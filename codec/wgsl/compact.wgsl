@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The place of each block's first record, in place of the number of its splats in view.
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Which splats of a page are in view: a bit each, and their number in each block. A scan of the numbers then gives every
 // block its place among the records, so that the order of records never depends on timing.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Squared error of two images in the range 0 to 1 before a background, summed over runs of 4,096 pixels: of all pixels,
 // of the covered pixels of the first image (csplat_render/metrics.py), and the number of these.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Numbers of workgroups of the passes that follow, from what has been counted; and the way from one step to the next.
 // `groups` holds x y z of the sort of records, of blocks of ranks and of the sort of pairs, then what a draw of quads takes.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Reads splats from the packed layout, which `csplat_render.gpu.packing` describes and writes.
 
 const TILE_ROWS = 12u;

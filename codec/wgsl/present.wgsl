@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Shows blended pixels before a background, as a triangle that covers the target.
 
 struct Backdrop { colour: vec4<f32>, width: u32, first_row: u32, unused0: u32, unused1: u32 }

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Projects the splats in view of a page, as csplat_render/projection.py does: a record of 32 bytes and a depth key each.
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Draws records as quads into half floats, farthest first, so that what is drawn later dims earlier rounding errors, too.
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Where each screen tile begins and ends among the sorted pairs.
 
 @group(0) @binding(0) var<storage, read> counters: Counters;

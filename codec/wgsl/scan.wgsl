@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Exclusive sums over a workgroup of 256, which never exceed SATURATED.
 
 const SATURATED = 0x7fffffu << 4u; // 2^27 - 16: more than any buffer holds; the sum of two is exact

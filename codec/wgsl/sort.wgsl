@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Stable radix sort by 8 bits of the key, least significant digit first: count digits, scan the counts, scatter. A
 // workgroup takes 4,096 elements in 16 rounds of 256; ranks among equal digits of a round come from bit masks, so that the
 // result does not depend on timing.

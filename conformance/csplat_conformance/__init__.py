@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Conformance tests of the csplat format: vectors with their expected results, runners and a validator.
 
 The vectors and the manifest are dedicated to the public domain (CC0 1.0). `csplat_authoring`, which is only in a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run csplat's Python decoder by the protocol of the suite (`protocol`), or in this process.
 
 csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}'

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Compare a decoder's answer for a vector with the manifest.
 
 | level | compares |

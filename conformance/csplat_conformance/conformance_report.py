@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Report a run of the suite: as a table for people, as JSON for programs, as JUnit XML for CI.
 
     >>> report = ConformanceReport("decoder", "my-decoder {input} {outdir}", [

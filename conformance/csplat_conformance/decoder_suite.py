@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run a decoder over the vectors and compare its results with the manifest.
 
     >>> from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin

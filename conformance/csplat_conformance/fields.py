@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Locate the fields of a file by name, and write structures with named fields."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The manifest: the vectors and their expected results."""
 
 from __future__ import annotations

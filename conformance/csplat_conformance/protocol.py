@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The protocol to test any decoder: one process for each vector.
 
     my-decoder INPUT OUTDIR

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """L4: compare renders of a scene, for given cameras, with reference images.
 
 Reference images are computed from the equations in binary64 (`csplat_render.reference_rasteriser`) over black, clipped

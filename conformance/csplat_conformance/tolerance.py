@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Tolerances of comparisons: SER-5 and SER-7 for declared errors, CNF-7 for floats."""
 
 from __future__ import annotations

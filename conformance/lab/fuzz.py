@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Fuzz the decoders and the readers of PLY and other formats with structured damage and repaired checksums.
 
 | target | must |

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The context of work: its ranges and defaults."""
 
 import numpy as np

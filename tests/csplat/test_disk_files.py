@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat.disk_files."""
 
 from __future__ import annotations

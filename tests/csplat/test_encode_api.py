@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes survive encoding and decoding within the errors that the file declares, or they are refused.
 
 Also: csplat.encoder.coding_parameters, csplat.encoder.encode_options, csplat.encoder.pipeline,

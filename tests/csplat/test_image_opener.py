@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One function opens all images: by their first bytes, as one of five formats, with a budget, and silently."""
 
 import io

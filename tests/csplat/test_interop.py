@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checkpoints and tensors of gsplat, splatfacto and INRIA as scenes; without torch an error names the extra.
 
 Also: csplat_trainer.torch_checkpoints.

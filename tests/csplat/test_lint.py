@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Defects of PLY files: their name in lint, the result of reading, and the error of strict reading.
 
 Also: csplat.ply.column_names, csplat.ply.columns, csplat.ply.ply_header, csplat.ply.ply_rows,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bytes of presets do not depend on the processor; exponentials and logarithms of `csplat.portable_math`."""
 
 import json

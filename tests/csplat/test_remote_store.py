@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files at URLs of a local web server and a local S3, through fsspec."""
 
 import io

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The SH basis, its gradient and its rotation, compared with the definition and with the tables of other programs."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files that are read in parts from a disk, memory or a store; `test_remote_servers.py` tests servers.
 
 Also: csplat.byte_store.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Systems other than Linux, whose calls are hidden here: each missing one has a replacement or a clear refusal."""
 
 import mmap

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Our file of the plain input, and the suite over it with altered statements."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_conformance.conformance_report."""
 
 import xml.etree.ElementTree as ET

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The conformance runner against decoders that are correct, misbehave, or have a planted fault.
 
 Also: csplat_conformance.adapter, csplat_conformance.answers, csplat_conformance.protocol,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The conformance vectors, their manifest, the documents for implementers, and our own decoder against them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """L4: reference pictures, and renderers within and beyond the tolerance."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kernels: numbers of threads, calls by several threads and by a forked child, an instruction set that is absent."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metrics of images: PSNR, SSIM and LPIPS with their kernels."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled search for entries finds what the search in NumPy finds, ties and extremes included."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nearest neighbours are those of a search through all pairs; points at one place are told apart by their rows."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs.
 
 Also: csplat_render.reference_rasteriser.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_render.virtual_cameras."""
 
 import numpy as np

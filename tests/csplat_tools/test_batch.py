@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat batch`: selection of scenes, repetition, files of others, interrupts, and clusters.
 
 Also: csplat_tools.cli.batch.

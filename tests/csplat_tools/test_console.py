@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress display: when it is shown, how often, and its text. The tests control the clock."""
 
 import io

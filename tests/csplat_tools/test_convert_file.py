@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat convert`: conversion between all formats, filters, reports of losses.
 
 Also: csplat_tools.cli.convert, csplat_tools.cli.decode.

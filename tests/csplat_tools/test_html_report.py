@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """HTML reports: `csplat info --page` on one file, and the page about a training; both fetch nothing."""
 
 import html

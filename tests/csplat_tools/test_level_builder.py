@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder.
 
 Also: csplat.decoder.tree, csplat_tools.level_errors.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_tools.level_fitting."""
 
 from dataclasses import replace

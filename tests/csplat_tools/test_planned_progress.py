@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress by a plan: the fraction of the whole run, whatever its stages report."""
 
 import pytest

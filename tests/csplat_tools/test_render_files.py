@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat render`: images, and films in the formats that Pillow writes and as MP4; refusals.
 
 Also: csplat_tools.cli.render, csplat_tools.present.scene_renders.

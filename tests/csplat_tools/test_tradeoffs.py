@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat tradeoff`: grids, failures, the Pareto front, the table, JSON, the page, and commands that repeat a row.
 
 Also: csplat_tools.cli.tradeoff.

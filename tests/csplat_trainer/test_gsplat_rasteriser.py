@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training, tuning and measuring through gsplat's interface, for which `gsplat_twin` stands in, against the CPU.
 
 Also: csplat_trainer.gsplat_derivatives.

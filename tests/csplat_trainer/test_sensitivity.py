@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensitivity of splats, against finite differences of the exact renderer; the command.
 
 Also: csplat_tools.cli.sensitivity.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_trainer.sensitivity_file.
 
 Also: csplat_tools.importance_file.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training in torch on the CPU, against the native engine.
 
 Also: csplat_trainer.torch_losses, csplat_trainer.torch_parameters.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The torch rasteriser and the perceptual loss, against their counterparts on the CPU."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training: the loop, resumed runs, `csplat train` to a PLY or a file; checkpoints, gains of images.
 
 Also: csplat_tools.cli.train, csplat_tools.training.training_run, csplat_trainer.engine,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_trainer.training_options.
 
 Also: csplat_trainer.training_report.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scene and an encoder as formulas, for tests of the search for a target without encoding or rendering.
 
 The law, for a file of n splats whose attributes keep q dB each, with x = E(p) the mean squared error of p dB:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The behaviour snapshot: bytes of files and keys of reports that no change of names or modules may alter.
 
 `behaviour.json` next to `tests/system/test_behaviour.py` holds

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small scene and images of it, for training, tuning and searches; a trained and a tuned scene, by the command line.
 
 Requires the extra [render].

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Helpers on models for tests: encode with everything checked, read along the axes of a format, covariances."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chromium for tests: a browser per session, a static server that counts requests, and page objects of the viewer."""
 
 import base64

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line in the process of the tests, batches without processes, and SIGINT in child processes."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Extreme scenes as PLY columns and through all stages.
 
 All are variants of one object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;

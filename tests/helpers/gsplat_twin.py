@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A stand-in for the function `rasterization` of gsplat, on the CPU."""
 
 import torch

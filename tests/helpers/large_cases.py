@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Helpers of the tests of large, which several files share."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models with metadata, for tests."""
 
 from dataclasses import fields, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """References for the rasteriser: random and adversarial splats, the exact twin, finite differences."""
 
 from dataclasses import dataclass

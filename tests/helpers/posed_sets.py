@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tiny data sets of each kind on disk: a few cameras that look at three dots."""
 
 import json

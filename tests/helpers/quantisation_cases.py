@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Helpers of the tests of quantisation, which several files share."""
 
 from __future__ import annotations

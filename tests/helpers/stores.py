@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stores of files that are read in parts: in memory, a local web server and a local S3.
 
 Memory and web server can be made to misbehave.

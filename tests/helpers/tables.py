@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of cases with one verdict per case: a single test checks them all, and names the cases that fail."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rasteriser's equations in plain torch, for gradients by autograd.
 
 It evaluates every splat at every pixel in float64, for a dozen splats and some hundred pixels.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small scene, its file and its source index, for tests of commands."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The behaviour snapshot (helpers/behaviour.py): bytes of files and keys of reports stay as they are."""
 
 import behaviour

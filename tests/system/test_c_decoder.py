@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The decoder in C: it compiles without a warning, passes the conformance suite, and its example runs."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: output, statuses, messages; no partial files, no tracebacks.
 
 Also: csplat_tools.cli.app.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat conformance`: reports for people, programs and CI.
 
 Also: csplat_tools.cli.conformance.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """README and documentation: links resolve, figures are the measured ones, examples run.
 
 Also: csplat_tools.inspect.file_report.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat extract` and `csplat merge`, as users run them.
 
 Also: csplat_tools.cli.extract, csplat_tools.cli.merge.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The unchanged samples of codec/EMBEDDING.md, and `<csplat-view>` in other pages."""
 
 import gzip
@@ -194,7 +195,9 @@ def test_the_engine_without_a_page(tab, site, model):
 def test_the_guide_contains_the_unchanged_examples():
     examples = ROOT / "tools" / "examples"
     for name in ("babylon", "playcanvas", "spark", "three"):
-        assert f"```js\n{(examples / name).with_suffix('.mjs').read_text('utf-8')}```\n" in TEXT
+        licence, _, sample = (examples / name).with_suffix(".mjs").read_text("utf-8").partition("\n")
+        assert "// SPDX-License-Identifier: Apache-2.0" == licence
+        assert f"```js\n{sample}```\n" in TEXT
 
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat encode`: reports, streams, refusals and options.
 
 Also: csplat_tools.cli.command_output, csplat_tools.cli.encode, csplat_tools.cli.shared_options,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loaders for three.js, Spark, PlayCanvas and Babylon.js in Chromium, with the versions that the examples pin."""
 
 import shutil

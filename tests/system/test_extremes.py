@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Extreme scenes: read, encoded, decoded, rendered, simplified, learnt; tools/docs/results/extremes.md has the results.
 
 Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, and two

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat info`: every byte is accounted for, as text and JSON.
 
 Also: csplat_tools.cli.error_lines, csplat_tools.cli.info, csplat_tools.inspect.text_reports.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Python interface: names, imports, errors, `SplatModel`, forms of files, and the commands that call it.
 
 Also: csplat.model, csplat.types, csplat_tools.optional_packages.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of other programs in csplat and ours in them: each property of a splat is equal within a step of the format.
 
 SPZ's own library is installed on demand. CONTRIBUTING.md describes where the other programs come from; tests of a

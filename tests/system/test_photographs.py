@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat compare --data` and `csplat render --data`; both check their inputs before they render."""
 
 import json

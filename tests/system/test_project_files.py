@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files that other programs read: attributes, metadata of packages."""
 
 import json
@@ -12,6 +13,7 @@ import pytest
 import csplat
 
 ROOT = Path(__file__).resolve().parents[2]
+SOURCE_ENDINGS = "c cc cpp css h html mjs py sh ts wgsl"
 in_a_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a checkout: git knows nothing of it")
 
 
@@ -35,6 +37,19 @@ def test_every_file_that_a_page_about_the_code_names_exists(page, least):
     found = {name for path in listed() for name in named if f"/{path}".endswith(f"/{name}")}
     assert len(found) >= least
     assert [] == sorted(name for name in named - found if "NAME" not in name)
+
+
+@in_a_checkout
+def test_each_source_file_begins_with_the_licence_of_its_folder():
+    def licence(path):
+        text = next(one for folder in path.parents if (one := ROOT / folder / "LICENSE").exists()).read_text("utf-8")
+        return "CC0-1.0" if text.startswith("Creative Commons Legal Code\n\nCC0 1.0") else "Apache-2.0"
+
+    paths = [Path(path) for path in listed(*(f"*.{ending}" for ending in SOURCE_ENDINGS.split()), ".ci/run")]
+    assert len(paths) > 700
+    for path in paths:
+        first_lines = (ROOT / path).read_text("utf-8").split("\n")[:2]  # the first may be a shebang or a doctype
+        assert any(f"SPDX-License-Identifier: {licence(path)}" in line for line in first_lines), path
 
 
 @in_a_checkout

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The unmodified pseudo-code of the spec against the decoder's vectorised functions."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat verify`: violations by clause, and declared errors against a source.
 
 Also: csplat_tools.cli.verify, csplat_tools.inspect.verification.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of the viewer in headless Chromium: loading, messages, control of the camera, the first picture."""
 
 import base64

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the viewer's engine, in headless Chromium, against the rasteriser's of the decoded model."""
 
 import base64

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line, conversion, comparison and reports around the csplat codec.
 
     >>> import csplat, csplat_tools

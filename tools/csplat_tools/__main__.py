@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat`: the program, and entry point of `python -m csplat_tools`."""
 
 from __future__ import annotations

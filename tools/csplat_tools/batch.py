@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run one command on many scenes, in processes of this machine or on a Dask cluster.
 
 Nothing is recorded between runs. An output that exists, is newer than its scene and passes its checks is not made

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Print data on standard output, messages and progress on standard error; format and parse sizes and durations.
 
 Progress is a bar on a terminal, otherwise a line every ten seconds. There is at most one display at a time.

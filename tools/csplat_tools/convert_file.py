@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convert scene files between formats, and filter their splats."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a scene file, in memory or out of core, as `csplat encode` does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Open the files, standard input and standard output of commands.
 
 `-` is standard input or output. A file appears under its name only when it is complete, and an existing file

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the HTML reports of commands: style, script, tables, bars, plots and images.
 
 A report is one page that loads nothing else; a policy in it forbids the network.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode with the importance in a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build the levels of detail of a scene of any size.
 
 Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent. Above the node that all

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure the errors of the nodes of levels of detail with the renderer (spec E.5), on the decoded splats.
 
 A node is compared with the splats of level 0 below it. If these are too many to be rendered at once, a finer level of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit the splats of a level of detail: keep splats that matter in renders, and refit them to renders of the scene.
 
 Views around the scene become smaller from level to level, so that a level is as good as it can be at the pixel size at

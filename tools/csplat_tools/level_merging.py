@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Merge neighbouring splats in pairs, starting with the pairs that change images least.
 
 The cost of a pair is the squared difference between images of both splats and of the splat that replaces them, over

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Load the renderer and optional packages, or raise an error with the remedy; describe the machine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress of a long run with several phases: the fraction of the whole, from the reports of its stages and a plan."""
 
 from __future__ import annotations

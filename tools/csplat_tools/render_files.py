@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write renders as PNG files or as a video."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read scenes in any format, and override their metadata."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure how much renders depend on each splat, for `csplat sensitivity`, tuning and quantisation classes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure size, quality and time of many encodings of a scene, for a table, JSON, and an HTML page with plots.
 
 A *grid* lists settings of `csplat encode`, as in `presets,precision=36:44,targets=38:1MB,simplify=0.5`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build the documentation site: collect its pages from the repository, then run MkDocs.
 
 A page is a Markdown file of the repository or generated. Links between files become links between pages, so any site
@@ -30,9 +31,11 @@ SOURCES = {
     "index.md": "README.md",
     "embedding.md": "codec/EMBEDDING.md",
     "implementers.md": "conformance/IMPLEMENTERS.md",
+    "hardening.md": "conformance/HARDENING.md",
     "javascript.md": "codec/js/README.md",
     "c.md": "codec/c/README.md",
     "format.md": "spec/format.md",
+    "media-type.md": "spec/media-type.md",
     "conformance.md": "conformance/README.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the images of README and documentation from the sample scene.
 
 `measured.json` holds the figures of the README's table and plot: bytes, PSNR over the eight views of `csplat compare`,

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // babylon.mjs
 import { ArcRotateCamera } from '@babylonjs/core/Cameras/arcRotateCamera.js';
 import { Engine } from '@babylonjs/core/Engines/engine.js';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // playcanvas.mjs
 import * as pc from 'playcanvas';
 import { CameraControls } from 'playcanvas/scripts/esm/camera-controls.mjs';

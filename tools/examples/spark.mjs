@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // spark.mjs
 import * as THREE from 'three';
 import { OrbitControls } from 'three/addons/controls/OrbitControls.js';

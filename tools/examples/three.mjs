@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // three.mjs
 import * as THREE from 'three/webgpu';
 import { OrbitControls } from 'three/addons/controls/OrbitControls.js';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Configuration of the example pages; `npm run build` builds them into dist/. The scene is in public/.
 import { defineConfig } from 'vite';
 import manifest from './package.json' with { type: 'json' };

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure what the readers need for the worst inputs that we know: bytes of memory and microseconds of CPU per byte.
 
     python tools/lab/budgets.py              # a table in Markdown, as in SECURITY.md

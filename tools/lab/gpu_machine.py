@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Train and tune a benchmark scene on a machine with a GPU that has neither a network nor csplat.
 
     python tools/lab/gpu_machine.py pack garden pieces            # here: the scene and wheels, in small folders

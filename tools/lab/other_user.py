@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run every command as a user without a home, with a read-only package and a full /tmp, and print a table.
 
 For Linux, as root, by hand: `python tools/lab/other_user.py [COMMAND…]`. The commands run in a mount namespace of their

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile the library of the renderer when a package is built, for wheels and for editable installs.
 
 The environment variable CSPLAT_NATIVE is `auto` (default: a wheel for every system, without the library, if it cannot

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prepare the packages of a release: check the tag, and write the address of the repository into their metadata.
 
 The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v0.1.0 URL=https://…`

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The initial view: from a camera of the file, or from an automatic camera.
 
 import { evened, findFrame, quantiles } from './bounding_frame.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Centre, size and kind (object or surroundings) of a scene, from samples of its splats. Unlike the bounding box of all
 // splats, they do not depend on a few distant ones.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Bounds of a scene: from the boxes of its tiles first, then from samples of its splats when layer 0 has arrived.
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Converts camera files of other programs to csplat's own form: cameras.json of INRIA, camera paths of nerfstudio,
 // transforms.json. `csplat_render/camera_files.py` describes them and reads them in the same way.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The cameras of a scene, from its file and the page's address: their list, the initial one, and the up direction.
 
 import {

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Cameras for cull and shaders, with the conventions of the rasteriser (csplat_render/conventions.py).
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The size of the drawing buffer: CSS size times pixel ratio, reduced while the camera moves on a slow machine.
 
 /** @typedef {{setSize: (width: number, height: number) => void}} Sized */

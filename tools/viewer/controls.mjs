@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Mouse, touch and keyboard input on the canvas, converted to camera movements.
 
 import { between } from './orbit_camera.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Frustum culling: whole tiles first, then splats. Conservative compared with the shaders: no visible splat is lost.
 
 import { ALPHA_MIN, DILATION, REACH_MAX, slopeLimits } from './camera_maths.mjs';

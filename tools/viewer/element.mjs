@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // <csplat-view src="scene.csplat" alt="A garden">: a scene in a page, used like an image and sized by CSS.
 //
 // Attributes: src, alt, crossorigin, and these parameters of main.mjs: camera, view, up, axes, background, backend; all of them

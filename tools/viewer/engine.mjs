@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The viewer's engine: a canvas, a scene and a camera. Decoding, culling and sorting run in a worker.
 //
 //   import { createEngine } from './engine.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Requests that the worker makes by functions of the page, which cannot be sent to it: `fetch` and `renew` of the engine's options.
 // The worker asks through a port of its own for each request; the page answers there.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Draws in the next animation frame, but not before the GPU has finished the previous one.
 
 const SECOND_MS = 1000;

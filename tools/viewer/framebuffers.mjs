@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Render targets: records of projected splats and the picture; and the quads that are drawn.
 
 import { UNITS } from './shader_programs.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Choices in a file with levels of detail: the tiles that are drawn, of those that are here, and the tiles to request.
 
 import { slopeLimits } from './camera_maths.mjs';

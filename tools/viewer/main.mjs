@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The page: an engine, a camera that the user moves, and the overlay.
 //
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0

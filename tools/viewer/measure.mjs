@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Measures the back ends on the scene of the page, and offers the result as JSON.
 
 import { createEngine } from './engine.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Writes an up direction to META of a file (spec 5.4). Index and header are updated, everything else is copied.
 
 import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The interactive camera: position, pivot, and lens fitted to the canvas. Independent of the DOM.
 
 import {

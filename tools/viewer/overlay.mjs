@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The overlay: progress, statistics, messages and drop target. Independent of scenes.
 
 import { explain } from './messages.mjs';

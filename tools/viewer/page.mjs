@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The parameters in the page's address, and the scene embedded in an exported page.
 
 import { ownCameras } from './camera_forms.mjs';

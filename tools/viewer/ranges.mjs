@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Allocation of ranges in memory that is written piece by piece: slots of splats, words and texels of tiles.
 
 /** Free ranges of some memory. */

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The interface of rendering back ends, and the choice of one.
 
 import { WebGl2Renderer } from './webgl2.mjs';

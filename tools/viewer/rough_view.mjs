@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Coarse renders of samples of a scene: how much detail a view shows, and the depth under a pixel.
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Offers to save the up direction that the user chose: as a rewritten file, or with a command.
 
 import { element, saveFile } from './overlay.mjs';

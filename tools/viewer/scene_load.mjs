@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // One call of the engine's `open`: receives a scene from the worker and tracks its parts.
 
 import { coarseBounds, fineBounds } from './bounds.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, and the order.
 
 import { toCamera } from './camera_maths.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Layout constants of the textures, and the shader code that reads attributes from them. texels.mjs describes the layout.
 
 /** Texels per row of the textures that are addressed by one number. */

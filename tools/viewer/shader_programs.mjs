@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Shader programs of the WebGL 2 back end and their uniforms.
 
 import { tileTexels } from './shader_attributes.mjs';

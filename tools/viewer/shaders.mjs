@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The shaders. A fragment pass projects the splats in order, one per pixel, into records; quads are drawn from the records.
 
 import { BLOCK_SPLATS } from './texels.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Sorting by depth: two counting passes over 22 bits of the depth's binary32 pattern.
 
 const DIGIT_BITS = 11;

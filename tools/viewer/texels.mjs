@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Packs a tile's integers into texels of four 32-bit words. shaders.mjs and codec/wgsl/layout.wgsl read them.
 //
 // Geometry is a string of bits per splat: means x y z, opacity, scales (three), quats x y z, sh0 r g b. The tile determines

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Growing textures that are addressed by one number, row by row.
 
 import { Ranges } from './ranges.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Reads what a view of a file requires: the coarsest version of the scene, then what is seen, the largest errors first,
 // layer 0 before the SH bands; then what surrounds it. Packs each part for the GPU as it arrives, and evicts what was not
 // needed for longest when the memory is full. A file without levels of detail is read completely.

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A small scene: to check whether a GPU draws what it should, so that WebGPU is chosen only where it works, and to compile
 // shaders before a scene arrives.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types shared by the viewer's modules. engine.mjs is the entry point for pages.
 
 import type { Description, FetchOptions, FetchReason, Header, TileRecord, TreeNode } from '../../codec/js/decoder.d.ts';

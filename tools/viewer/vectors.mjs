@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Three-component vectors and rotations, for the page's cameras. All functions return new values.
 
 /**

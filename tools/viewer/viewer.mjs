@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The viewer: an engine, a camera with its controls, and a canvas that follows the page's size. The page (main.mjs) and the
 // element (element.mjs) are built on it.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The WebGL 2 back end. renderer.mjs documents its methods.
 
 import { slopeLimits } from './camera_maths.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The WebGPU back end: culling, projection, sort and blending on the GPU, with the shaders of csplat_render/gpu. Pictures are
 // blended by screen tiles or as quads, as options say or a short measurement decides. renderer.mjs documents its methods.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A WebGPU device with its compiled passes and growing buffers. The shaders are those of csplat_render/gpu.
 
 import { Ranges } from './ranges.mjs';

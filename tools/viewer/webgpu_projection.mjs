@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Finds the splats in view, projects them into records and sorts these by depth, on the GPU. What exceeds the records is
 // drawn in slices of depth, nearest first.
 

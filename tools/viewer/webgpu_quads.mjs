@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Blends records as quads in half floats, by the hardware for rasterising and blending: less exact than screen tiles, and
 // faster on some GPUs.
 

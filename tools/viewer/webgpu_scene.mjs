@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The memory of one scene on a WebGPU device. csplat_render/gpu/packing.py describes the layout.
 
 import { toCamera } from './camera_maths.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Blends records by screen tiles, in binary32: lists the screen tiles of each splat, sorts these pairs, and blends each
 // screen tile in workgroup memory. What exceeds the buffers is drawn in bands of rows and in steps.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Render Gaussian splats: rasteriser with gradients, exact reference, GPU renderer, cameras, image metrics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pinhole camera, cameras that look at or orbit a point, and sets of cameras."""
 
 from __future__ import annotations

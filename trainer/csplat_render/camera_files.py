@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read and write csplat's camera files, and read other programs' camera files.
 
 * csplat: a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes, pixel centres at +0.5; `near`

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closed camera paths for films that loop without a jump.
 
 An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), at a distance that shows all of

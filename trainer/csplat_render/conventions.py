@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shared definitions of the rasteriser and its exact reference: constants, modes, splats and results.
 
 The conventions follow INRIA's implementation (Kerbl et al., 3D Gaussian Splatting, 2023):

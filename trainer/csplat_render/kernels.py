@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Call the functions of the compiled library `native`, on threads.
 
 No result depends on the number of threads; nor, for finite numbers, on the instruction set of the processor.

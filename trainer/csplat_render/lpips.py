@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """LPIPS v0.1 with AlexNet (Zhang et al. 2018), without PyTorch.
 
 With F_l the features after AlexNet's convolution l, scaled to unit length per pixel, the distance is

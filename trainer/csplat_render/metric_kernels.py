@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SSIM and the convolution of LPIPS: the kernels of `native/images.cpp`, and their twins.
 
 SSIM (Wang et al. 2004) of a pixel is

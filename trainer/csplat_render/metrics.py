@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Similarity of two images: PSNR and SSIM, pooled over views.
 
 Conventions:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search the nearest entries of a codebook, for the encoder: an entry point of `csplat.kernels`."""
 
 from __future__ import annotations

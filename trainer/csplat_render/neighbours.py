@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find the nearest neighbours of points in space."""
 
 from __future__ import annotations

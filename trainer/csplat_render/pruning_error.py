@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pruning error: the exact leave-one-out error of every splat, in one pass over views.
 
 It is exact for pruning a single splat, with two exceptions: a finished pixel stays finished, although it might continue

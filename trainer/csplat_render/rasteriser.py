@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`Rasteriser`: render splats, and compute sums and gradients with respect to them, on all threads of a CPU.
 
 The passes are written in C++, see `native`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The exact reference: renders directly from the equations of `conventions`, in float64 NumPy, slow.
 
 Every splat is evaluated at every pixel. The reference shares the conventions of the rasteriser but none of its methods:

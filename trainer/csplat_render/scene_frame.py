@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frame of a scene (centre, extent, up, kind), and a point cloud that represents its surface.
 
 There are two kinds of scene: an *object* is viewed from outside; *surroundings* extend far beyond their dense middle.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`Scorer`: compare renders of scenes with reference images, which are renders of a source or images of a data set.
 
 `metrics` defines PSNR.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Estimate the up axis of a scene that does not specify it, for viewing only; estimates are not written to files.
 
 Objects are usually photographed from all around and from above, seldom from below. So they show fine splats from above,

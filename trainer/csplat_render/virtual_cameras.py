@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Virtual cameras around a scene that has none: the cameras of `psnr`.
 
 An *object* is viewed from all sides at low to high elevations, close enough to cover at least half of each image. In

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training of Gaussian splats on a CPU or a GPU: data sets, losses, optimisation, and a torch wrapper of the renderer.
 
     >>> import csplat_trainer

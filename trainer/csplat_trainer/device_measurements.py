@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure splats exactly on the CPU, or estimate on a GPU; make the rasteriser that torch uses on a device."""
 
 from __future__ import annotations

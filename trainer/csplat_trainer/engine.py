@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One training step: render, loss, gradients, Adam, noise; on the CPU, without torch."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checkpoints of a `Fitter`, from which a training or a tuning continues exactly."""
 
 from __future__ import annotations

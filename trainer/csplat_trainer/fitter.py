@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`Fitter`: the loop of training, quantisation-aware tuning and refitting, an image per step."""
 
 from __future__ import annotations

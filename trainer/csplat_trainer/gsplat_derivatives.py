@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """Pruning errors and squared derivatives of renders, estimated on a GPU by backward passes.

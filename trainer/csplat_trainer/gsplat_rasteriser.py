@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch and gsplat may be absent:
 # pyright: reportMissingImports=false
 """The gsplat package as rasteriser of `TorchEngine`, and of measurements on a GPU."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Per-image gain and bias, for images of one scene with different exposure.
 
 Renders are corrected before the comparison with an image, as in the code of "A Hierarchical 3D Gaussian Representation"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Initial splats: at known points, inside the visual hull of the masks, or anywhere in a box."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """The photometric loss, L1 and SSIM in one pass, with its gradient; and LPIPS as an additional term.

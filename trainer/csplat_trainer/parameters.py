@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The trained parameters of splats, and Adam's moments.
 
 Opacities are logits. Each step normalises quaternions.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`PosedImage`: an image of a data set with its camera, stored as bytes and converted to float on demand."""
 
 from __future__ import annotations

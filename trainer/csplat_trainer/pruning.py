@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pruning order of splats: by the exact error of removing each from renders, measured again in rounds.
 
 Pruned splats may have hidden others, so that errors change. Targets, `simplify`, fine-tuning and training use this

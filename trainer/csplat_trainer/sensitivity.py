@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensitivity of renders to each splat, attribute by attribute, measured from training or virtual cameras.
 
 The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, with E_i the sum of the red, green

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of sensitivities: an array per group, and a digest of the scene. Requires NumPy, but not the renderer."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Refit kept splats to renders of the source by gradient descent.
 
 Colours, opacities, scales and rotations are fitted together, one small view per step, so that neighbours of pruned

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Changes of the number and positions of splats during training: MCMC, gradient-based densification, pruning.
 
 * "3DGS as Markov chain Monte Carlo", Kheradmand et al. 2024, https://arxiv.org/abs/2404.09591. A dead splat moves onto

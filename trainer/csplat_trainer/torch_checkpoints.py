@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """Checkpoints of gsplat's simple_trainer, nerfstudio's splatfacto, INRIA's trainer and others, read as scenes.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """Training steps in torch, with the interface of `CpuEngine`: on a GPU, and as a readable reference on a CPU."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """The photometric loss in torch, with its gradient, as `losses.PhotometricLoss`; and images in the memory of a GPU."""

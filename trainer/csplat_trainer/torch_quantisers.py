@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """Quantisers of a file in torch, twins of `FixedQuantisation.dequantise`, which returns the same values bit for bit.

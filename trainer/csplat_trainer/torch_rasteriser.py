@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """csplat's rasteriser as a differentiable function of torch, and the interface of rasterisers to `TorchEngine`."""

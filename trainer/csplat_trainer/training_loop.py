@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`train`: train splats on images."""
 
 from __future__ import annotations

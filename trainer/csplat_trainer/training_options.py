@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`TrainOptions`; the files that a run reads and writes, and its result."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports of a training run: loss plot, previews, memory."""
 
 from __future__ import annotations

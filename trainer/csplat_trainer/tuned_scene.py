@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The state of fine-tuning: float values, their quantised form in the file, and the rate term of the loss.
 
 Straight-through estimator: images are rendered from the decoded values, and their gradients are applied to the values

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Coverage-guided fuzzing of the decoder, by libFuzzer:
  *
  *     make fuzz-c

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Compare csplat_inflate with zlib by libFuzzer: both accept the same streams and return the same bytes. `make fuzz-c` */
 #include "../inflate.c"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Adapts the C decoder to the protocol of the conformance suite (conformance/IMPLEMENTERS.md):
  *
  *     csplat conformance decoder --cmd 'csplat_adapter {input} {outdir}'

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Tests beyond the conformance suite: failing callbacks, budgets, invalid arguments, a lower degree, boxes of cuts.
  *
  *     interface FILE...        status 0, or the line number of a failed check on standard error */

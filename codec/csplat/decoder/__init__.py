@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decode `.csplat` files into arrays, checking every clause of the specification.
 
 The package was written from `spec/format.md` alone. It shares only the registry's constants, the errors and

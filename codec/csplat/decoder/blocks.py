@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Represent blocks of integers, and read codings of a single stream: LEVELS, MORTON, AXIS, OFFSET, SIGNED (spec 6.4).
 
 Every block has `rows(start, stop, dtype)`, which returns the integers of a run of splats, and `bound`, the largest

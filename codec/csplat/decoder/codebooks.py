@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read codebooks, tables of integer vectors that tiles refer to (spec 5.3)."""
 
 from __future__ import annotations

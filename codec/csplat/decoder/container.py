@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the file header and the frames of chunks, and check their CRCs (spec 4.2, 5.1).
 
 The whole decoder reads from one `memoryview` of the file, so that offsets in errors are offsets in the file.

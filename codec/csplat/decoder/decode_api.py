@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decode whole scenes, or some tiles and SH bands, at once or tile by tile."""
 
 from __future__ import annotations

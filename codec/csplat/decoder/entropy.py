@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read streams: head, coder and transforms (spec 6.1 to 6.3)."""
 
 from __future__ import annotations

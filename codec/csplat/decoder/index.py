@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read and check header and index (spec 4.3)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check the caller's limits (LIM-1) against the index before anything is allocated."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the chunks other than tiles and codebooks: JSON texts (spec 5.4) and declared error bounds (spec 5.5)."""
 
 from __future__ import annotations

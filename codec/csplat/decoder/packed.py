@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convert the blocks of a tile to integers of splats and tables of codebooks (`csplat.packed`)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reconstruct float32 values from integers (spec 7): one product in binary64, rounded once.
 
 Each `write_…` fills the output of one tile. `lattice_rows` and `quat_rows` yield checked integers, colours as red,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the blocks of tiles, in every attribute coding, and check the ranges of their integers (spec 5.2, 6.4)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the nodes of the levels of detail, and cut through them (spec 5.7)."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Edit scenes and files: merge, transform, change the up direction."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Extract a part of a file: copy tiles to another file without decoding their streams."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Merge several files: copy their tiles if possible, otherwise decode the scenes and encode them together.
 
 Copied tiles are not decoded; only their codebook ids are replaced by the ids in the merged file.

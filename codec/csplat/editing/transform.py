@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transform scenes: rotate, mirror, scale, translate, stretch, and convert axes.
 
 The mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ is the same for M and -M, and either M or -M is a

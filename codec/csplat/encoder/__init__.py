@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode scenes to `.csplat` files.
 
 `csplat.encode` encodes in one call, with the given options or to a `Target`. `EncodePlan` and `encode_tiles` encode in

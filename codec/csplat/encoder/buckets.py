@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Divide a large scene into buckets of neighbours, and survey it.
 
 A scene of up to `EncodeOptions.bucket_splats` splats is one bucket. For a larger scene, a sample of that size is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Choose the coding parameters of a file (steps, levels and codings) from options, preset and scene.
 
 One number, the quality in dB, sets all steps. The error in renders that a step causes differs between scenes by a

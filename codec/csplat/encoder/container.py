@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write header, index and chunks of a file (spec 4 and 5)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Define the options of the encoder and its presets."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plan the encoding of a scene: steps, quantisation classes, tiles and shape codebook, before colours are final.
 
     plan = EncodePlan.of(model, options)

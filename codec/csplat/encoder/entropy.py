@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Code integers as bytes: Morton codes, transforms, DEFLATE, and the blocks of a tile (spec 6)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search the nearest entries of a codebook, with the same result for any number of threads, compiled or in NumPy.
 
 As |x - c|² = |x|² - 2 (x·c - |c|²/2), the nearest entry has the highest score x·c - |c|²/2, which is the product of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure the errors of decoded splats, which a file declares (spec 5.5).
 
 The encoder measures tile by tile, by the functions on columns; `measured_sums` compares two models.

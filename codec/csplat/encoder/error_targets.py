@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find steps with which no splat's error exceeds given bounds, by encoding and measuring."""
 
 from __future__ import annotations

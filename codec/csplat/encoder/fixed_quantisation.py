@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fix the quantisation of a scene while its values change, so that fine-tuning works on decoded values.
 
 `fix_quantisation` makes all discrete choices: steps, tiles, codebooks, the assignment of splats, escapes, and zero SH

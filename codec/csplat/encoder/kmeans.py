@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cluster lattice integers by weighted k-means, with the same result for any number of threads.
 
 Assignments are exact (`entry_search.py`). Centroids are float64 sums in the order of the points, rounded to integers.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a scene with levels of detail (spec 5.7), which a caller with a renderer has built."""
 
 from __future__ import annotations

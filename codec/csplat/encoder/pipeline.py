@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a planned scene to a file in two steps, `encode_tiles` and `EncodedTiles.write`.
 
 The second step takes almost no time, so that a file can be written, measured, and written again with its own PSNR.

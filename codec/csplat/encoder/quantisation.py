@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quantise values to lattice integers, and dequantise them as a decoder does (spec 7).
 
 Arrays are in columns, [C, n], in the order of the streams; NumPy's inner loops are then long.

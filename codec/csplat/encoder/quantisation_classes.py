@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Choose quantisation classes: splats whose errors are equally visible share tiles, and each class has its own steps.
 
 Doubling a step multiplies the squared error of renders by four and saves a bit per integer. The rate at a given

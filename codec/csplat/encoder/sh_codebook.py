@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode SH bands 1 to 4 with scalar coding or a codebook with escapes, whichever is smaller at equal distortion.
 
 (Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene. For a scene with more splats than a bucket it is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode shapes (scales and rotations), with a codebook if that makes the file smaller (spec 6.4.5).
 
 The covariance divided by its trace is clustered, as in Niedermayr, Stumpfegger and Westermann ("Compressed 3D Gaussian

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Weigh the errors of splats by their effect on renders.
 
 Importance is one number per splat. Gauss-Newton blocks are matrices M: an error e of a splat's values adds eᵀ M e to

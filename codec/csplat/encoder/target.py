@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The target of an encoding, and the report of the search that met it."""
 
 from __future__ import annotations

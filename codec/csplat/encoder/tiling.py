@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Partition splats into tiles, and order them (spec 3, 4.3.5)."""
 
 from __future__ import annotations

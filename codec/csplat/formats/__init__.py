@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read and write splat files in any format.
 
 Each format has a module or package with a `FORMAT`; `formats` lists them. A file is identified by its content, and by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shared steps of the formats: rows to scenes, checks of values, quaternion packing, sorting on a Z curve."""
 
 from __future__ import annotations

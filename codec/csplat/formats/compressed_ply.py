@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PlayCanvas' compressed PLY: attributes packed into words, relative to the bounds of chunks of 256 splats.
 
 Follows `decompress-ply.ts` and `compressed-chunk.ts` of splat-transform (MIT). Metadata is stored in header comments,

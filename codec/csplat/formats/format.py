@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Describe a file format: its reader, its writer, and the parts of a scene that it can store."""
 
 from __future__ import annotations

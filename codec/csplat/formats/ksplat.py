@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read .ksplat 0.1 of mkkellogg/GaussianSplats3D: rows of floats, or of smaller types relative to bucket centres.
 
 Level 0 is float32 throughout. Levels 1 and 2 store 16-bit positions in a block around the centre of a bucket of splats

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read and write .splat of antimatter15/splat: 32 bytes per splat, without header, SH or axes.
 
 Positions and standard deviations are floats; colours, opacities and rotations are bytes. Only the file name identifies

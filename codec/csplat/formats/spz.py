@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SPZ of Niantic and Adobe, versions 1 to 4: fixed-point positions, bytes for the rest, attribute by attribute.
 
 Versions 1 to 3 are a single gzip stream, version 4 has a Zstandard stream per attribute. The axes are right, up, back

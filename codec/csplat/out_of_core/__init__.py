@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode scenes that do not fit in memory bucket by bucket on disk, with the same bytes as in memory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode buckets from splats on disk to tiles on disk: in this process, several processes or on a Dask cluster.
 
 The file of a coded bucket has a head (size and CRC of the records), records of its tiles and nodes as JSON, and the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sort the splats of a scene into buckets in a working folder, from which an interrupted encoding continues.
 
 Each section of the bucket curve has a spill file; a large section is split into several buckets, which are ranges of

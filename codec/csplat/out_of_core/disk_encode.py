@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a scene in buckets on disk if it does not fit in memory, and estimate the cost of an encoding."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PLY files of 3D Gaussian splats: INRIA's layout and its variants.
 
 | module | contents |

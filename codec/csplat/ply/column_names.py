@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find the columns of a splat PLY by their usual names or by the names that other programs give them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convert the rows of a splat PLY to the arrays of a model, with safe repairs.
 
 Blocks of rows fit in the cache while each group of columns is copied, checked and repaired. This single pass over

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read and write the metadata of a scene as comment lines of a PLY header, and split positions from their origin.
 
 | comment | meaning |

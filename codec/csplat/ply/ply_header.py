@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rewrite headers and text rows that plyfile does not accept although their meaning is clear.
 
 Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`. Text rows may share

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read PLY files of 3D Gaussian splats.
 
 This is the only module that imports plyfile, which is GPL-3.0-or-later, so programs that embed the decoder and never

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Skip rows of PLY files, and the lists in rows, without keeping an object per row.
 
 Properties are plyfile's objects, which have a `name` and a `val_dtype`. Lists also have a `len_dtype`.

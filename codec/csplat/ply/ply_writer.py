@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write a scene as a PLY in INRIA's layout, which all splat viewers open."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types of the plugin for Babylon.js. Importing the module registers the plugin.
 
 import type { AssetContainer } from '@babylonjs/core/assetContainer.js';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A plugin of Babylon.js's scene loader for .csplat. Importing this module registers it. See babylon.d.ts.
 //
 //   import 'csplat-decoder/babylon';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Mirrors packed tiles in x, for left-handed scenes in engines that can rotate splats but not mirror them.
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types that the adapters for engines share.
 
 import type { ByteSource, Header, ReaderOptions } from '../decoder.d.ts';

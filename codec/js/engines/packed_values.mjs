@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Converts packed tiles to numbers of any type and layout, for the adapters of engines.
 
 /**

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Stores a file's integers in textures for PlayCanvas, in the narrowest format that the scene allows. Independent of the
 // engine, for testing.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types of the adapter for PlayCanvas.
 import type { AppBase, Asset, Entity, GSplatResourceBase } from 'playcanvas';
 import type { LoadOptions, SceneFacts } from './options.d.ts';

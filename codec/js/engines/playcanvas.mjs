@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // .csplat in PlayCanvas 2.23: `app.loader.getHandler('gsplat').addParser(new CsplatParser(app))`. See playcanvas.d.ts.
 // Textures hold the integers of the file; the shaders below convert them to values.
 

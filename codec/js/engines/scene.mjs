@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';

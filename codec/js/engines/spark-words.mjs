@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Packs tiles into the words of Spark's splats. Independent of the engine, for testing.
 
 import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types of the adapter for Spark.
 import type { SplatMesh } from '@sparkjsdev/spark';
 import type { LoadOptions, SceneFacts, SceneSource } from './options.d.ts';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // .csplat in Spark (@sparkjsdev/spark 2.2, three.js): `scene.add(await loadCsplat('scene.csplat'))`. See spark.d.ts.
 
 import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Types of the loader for three.js.
 
 import type { BufferGeometry, Loader, LoadingManager, Matrix4 } from 'three';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A loader for three.js: loads a .csplat as the same geometry as three.js's own splat loaders. See three.d.ts.
 //
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');

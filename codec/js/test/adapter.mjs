@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Adapts this decoder to the protocol of the conformance runner (conformance/IMPLEMENTERS.md), one process per file:
 //
 //   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'

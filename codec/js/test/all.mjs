@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // All tests of the decoder and the viewer in one process, which compiles the decoder once and takes half the time of one
 // process per file: `node codec/js/test/all.mjs`, or with a report of each test `node --test-reporter=spec …`.
 import { readdirSync } from 'node:fs';

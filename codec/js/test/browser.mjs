@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Run browser.html under two policies, in headless Chromium: `node codec/js/test/browser.mjs`; in other engines:
 // `node codec/js/test/browser.mjs firefox-esr`, `xvfb-run -a node … /usr/lib/x86_64-linux-gnu/webkit2gtk-4.1/MiniBrowser`.
 import { spawn } from 'node:child_process';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Every vector of the conformance suite: decoded whole, as floats and as integers, and tile by tile.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

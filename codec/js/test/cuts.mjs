@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 /**
  * Return the options of `cut` for a cut of the conformance suite.
  *

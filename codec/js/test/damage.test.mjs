@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Damaged files are refused with a CsplatError: they are not decoded, and cause no other exception.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

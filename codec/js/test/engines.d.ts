@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The parts of the engines that their adapters use, for type checks without the engines' packages.
 
 declare module 'three' {

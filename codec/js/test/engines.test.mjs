@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The adapters for engines return the numbers of the form 'floats', in the engines' layouts.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

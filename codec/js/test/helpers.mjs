@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Helpers of the tests: the conformance vectors, hashes, repaired checksums, a server.
 
 import { createHash } from 'node:crypto';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Whatever the caller's hooks throw or return, the decoder answers with an error of its own.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

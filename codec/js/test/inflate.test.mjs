@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Both inflate implementations enforce the declared size and the end of the stream.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

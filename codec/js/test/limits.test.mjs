@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Budgets, options and invalid arguments.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Generates mutants of JavaScript modules: one changed operator, constant, bound or statement each (csplat_selftest.mutation).
 //
 //   node operators.mjs .../typescript/lib/typescript.js a.mjs b.mjs    # one line of JSON: [[file, line, start, old, new], ...]

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The form 'packed' has the same values as the form 'floats', for every vector and layer.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Checksums, strict JSON and exact products.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

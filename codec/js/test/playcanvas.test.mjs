@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The textures of the PlayCanvas adapter have the values of the form 'floats'.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

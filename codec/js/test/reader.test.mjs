@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // CsplatReader over HTTP, with and without ranges, and its errors.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Answers of servers, as they should be and as they are: each row of a table is read to its end, or refused with its reason.
 import assert from 'node:assert/strict';
 import { createServer } from 'node:http';

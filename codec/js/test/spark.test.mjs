@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The words of Spark's splats have the values of the file, to the precision of their bits.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

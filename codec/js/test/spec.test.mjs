@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The generated constants match the layout of header and index in the spec.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';

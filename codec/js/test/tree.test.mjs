@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Levels of detail: nodes, cuts, boxes, and the tiles of coarser levels.
 import assert from 'node:assert/strict';
 import { spawnSync } from 'node:child_process';

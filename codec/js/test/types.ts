@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Checks that decoder.mjs matches decoder.d.ts. Compiled, never run.
 
 import * as implementation from '../decoder.mjs';

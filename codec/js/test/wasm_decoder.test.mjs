@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The WebAssembly decoder alone: what it decodes and refuses without the JavaScript modules as a fallback.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Tiles decoded by workers: the same scenes and refusals as without workers, also if no worker starts.
 import assert from 'node:assert/strict';
 import { spawnSync } from 'node:child_process';

@@ -1,6 +1,6 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The interface of the C decoder for JavaScript (../wasm_decoder.mjs). An instance decodes one file, which it reads with the
- * import `read`. It has no messages: JavaScript decodes refused files again to report the error.
- * SPDX-License-Identifier: Apache-2.0 */
+ * import `read`. It has no messages: JavaScript decodes refused files again to report the error. */
 #include "../../c/csplat.c"
 
 #define EXPORT(name) __attribute__((export_name(#name))) js_##name

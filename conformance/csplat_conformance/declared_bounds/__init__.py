@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Verify declared error bounds: the errors that a file declares against its source (spec 5.5, chunk SERR).
 
     >>> from csplat_conformance.declared_bounds import Source, verify_bounds

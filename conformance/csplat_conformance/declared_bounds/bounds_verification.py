@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Verify the error bounds that a file declares against its source (spec 5.5).
 
 With a source index, maximum, rms and counts are verified. Without it, each splat of the file must have a splat of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Measure the differences between decoded splats and their source splats (spec 5.5, 5.6).
 
 The code is independent of the encoder's, so that each reveals errors of the other. Arithmetic is float64, in blocks

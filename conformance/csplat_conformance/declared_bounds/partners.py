@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Find a source splat within given bounds for each decoded splat, if no source index is known.
 
 Source splats are sorted by the cells of a grid over centre, opacity and green. Cells are twice as wide as the bounds,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Measure the pairs of a source index tile by tile, if file and source do not fit in memory together.
 
 The source is read in order, once for each group of tiles whose source splats fit in memory.

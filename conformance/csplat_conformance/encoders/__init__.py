@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The encoder suite: reference inputs, and checks of the files that an encoder writes for them (spec 9.3).
 
     >>> from csplat_conformance.encoders import run_encoder

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Reference inputs for encoders: generated PLY files and their sources.
 
 An encoder must accept `ordinary/`. It may refuse `nasty/` with status 1 and a line with the reason, but must not encode

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run an encoder on an input, and check its exit status, side effects and repeatability (L1)."""
 
 from __future__ import annotations

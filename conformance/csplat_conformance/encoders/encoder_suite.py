@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run an encoder over the reference inputs and check its files level by level."""
 
 from __future__ import annotations

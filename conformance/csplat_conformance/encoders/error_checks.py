@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """L3: check the error bounds that a file declares, and warn of bounds that are correct but probably unintended.
 
 Files with coarse values are valid. A warning means that the values are probably coarser than intended. `separation` is

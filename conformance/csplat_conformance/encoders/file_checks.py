@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Check that a file of an encoder is valid (L1) and contains its source (L2)."""
 
 from __future__ import annotations

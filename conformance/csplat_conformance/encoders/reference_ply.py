@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Write PLY files as trainers do, and return their sources independently of the PLY reader under test.
 
 The columns follow the reference implementation of 3D Gaussian splatting: centres, base colour `f_dc`, higher

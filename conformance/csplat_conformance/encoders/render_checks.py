@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Compare renders of a file with renders of its source (L4)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Build scenes for renders: closed surfaces of discs, like trained scenes, dense enough to reveal every mistake.
 
 The other inputs are sparse random clouds, in which a wrong rotation or opacity hardly changes a render.

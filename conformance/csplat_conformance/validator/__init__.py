@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The strict validator: report every violation of a file by clause, not only the first (spec 9.1, CNF-1).
 
     >>> from csplat_conformance.validator import validate

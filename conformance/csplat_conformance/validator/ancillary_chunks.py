@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Check ancillary chunks: the JSON texts META, CAMS and OPTS (spec 5.4), and the declared error bounds SERR (5.5)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Index (spec 4.3): head and records, directory, tiles, and the chunks that they name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Inflate DEFLATE (RFC 1951, spec 6.2) bit by bit: slow, but it identifies the clause that a stream violates."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Read streams (spec 6.1 to 6.3): the head, the coder, the transforms."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Check TILE and CODB chunks (spec 5.2, 5.3) and the codings of blocks (6.4)."""
 
 from __future__ import annotations

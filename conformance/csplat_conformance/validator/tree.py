@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Check TREE, the nodes of the levels of detail (spec 5.7)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Validate a file from the first byte to the last: header, index, chunks."""
 
 from __future__ import annotations

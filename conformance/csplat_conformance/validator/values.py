@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Check the ranges of integers and of the values that they represent (spec 6.4, 7)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Results of a validation, readers of structures with their offsets, the log of violations, and codes of clauses."""
 
 from __future__ import annotations

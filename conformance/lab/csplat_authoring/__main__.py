@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Write the vectors, the manifest, and annexes A and C of the spec.
 
 Usage:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Annexes A and C of the spec: the worked example, byte by byte, and the map of clauses to vectors."""
 
 from __future__ import annotations

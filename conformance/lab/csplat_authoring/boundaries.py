@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Boundary cases: for each rule of the registry, files with the nearest forbidden values in the field.
 
 The checks that refuse them are written by hand in the decoders and in the validator, so that the cases reveal a rule

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Write a declared scene as the bytes of a csplat file, field by field in the order of the spec; repair checksums.
 
 The builder shares no code with the encoder and checks nothing: it writes invalid files if the scene is invalid. Every

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Transforms and coders of streams for vectors: simple and slow, with the same bytes on every machine.
 
 No compression library is used, so that vectors do not change with library versions. DEFLATE streams (RFC 1951) can be

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Scenes and vectors declared in TOML.
 
 Each file of `chapters/` covers a section of the specification. A table is a vector: `[valid.NAME]`, `[extreme.NAME]` or

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Recipes of vectors: valid files, and files with a defect."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Compute the expected result of decoding a scene, directly from the formulae of the spec (sections 6.4.5, 7, 9.2).
 
 It uses Python integers and single IEEE operations: slow on purpose, and independent of `csplat.decoder`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Small scenes and blocks of pseudo-random integers, which the recipes vary."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The declared scene of a vector: every number of the file, and the coding of each stream.
 
 Values that a vector may set incorrectly are never derived. `builder` writes a scene as bytes, and `reference` computes

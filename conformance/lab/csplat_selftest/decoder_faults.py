@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Plant typical mistakes of implementers in our decoders, and check that the suite notices each of them.
 
 Usage:

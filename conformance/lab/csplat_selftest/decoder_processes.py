@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run the decoders in C and JavaScript, which are only in a checkout, in processes that decode many files."""
 
 from __future__ import annotations

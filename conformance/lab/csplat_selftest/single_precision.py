@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Reconstruct values in single precision as a GPU does (spec 7), and measure their distance from exact values.
 
 Usage:

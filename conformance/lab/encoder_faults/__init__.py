@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Faulty encoders: csplat's encoder with one planted fault at a time, to test the conformance suite.
 
 Usage:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Print the table of faulty encoders, or run one of them."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Faults in exit status, output files, treatment of the user's files, and the source index."""
 
 import os

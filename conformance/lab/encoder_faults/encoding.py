@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Faults in converting values to integers, in bytes of the file, and in what the file declares; output by chance.
 
 Errors are measured after the conversion, so the files declare them honestly.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The type of a fault, ways to make one, and the scenes that declared errors are measured against."""
 
 import contextlib

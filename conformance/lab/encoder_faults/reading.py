@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Faults in reading a PLY and preparing the scene: columns, rows, numbers, header, range, frame, metadata."""
 
 from dataclasses import replace

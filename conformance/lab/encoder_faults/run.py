@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Run our encoder with a planted fault, and the conformance suite on it."""
 
 from __future__ import annotations

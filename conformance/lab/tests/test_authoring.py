@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The vectors equal their recipes, reference images included."""
 
 import subprocess

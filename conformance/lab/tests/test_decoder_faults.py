@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Decoders with a planted fault: a vector that names the clause fails, and the decoder is right again afterwards."""
 
 from contextlib import ExitStack

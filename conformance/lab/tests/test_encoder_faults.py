@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Faulty encoders: the suite reports each one at the level and with the clause that it declares."""
 
 from collections import Counter

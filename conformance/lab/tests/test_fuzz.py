@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """The fuzzer: each target runs, and files on which something went wrong once stay harmless."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Damaged files, fields, streams and JSON texts: each is refused by a typed error with code, offset and clause.
 
 Also: csplat.decoder.entropy, csplat.decoder.index, csplat.decoder.reconstruct, csplat.decoder.tiles.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whole files and parts of them; the files come from the conformance suite's writer, never from our encoder.
 
 Also: csplat.decoder.blocks.

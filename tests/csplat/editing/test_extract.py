@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Editing without decoding: parts of a file as files of their own, and several files as one.
 
 Also: csplat.editing.merge.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The up axis: read, estimated and kept; scenes in other coordinates; everything that shows a scene agrees on up.
 
 Also: csplat_render.up_estimate.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plans of files, their colours and origins, and what the files that they give declare."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat.encoder.entropy: streams are read back by the pseudo-code of the spec."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Searches find the nearest entries, the first of several, in all groups or in near ones."""
 
 from __future__ import annotations

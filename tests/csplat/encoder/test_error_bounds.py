@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measured and declared errors agree with the definitions of the spec, and sources with their rows."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixed quantisations, which equal the decoded file bit for bit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Codebooks: k-means finds near entries at any thread count; codebooks of shapes make smaller files.
 
 Also: csplat.encoder.shape_codebook.

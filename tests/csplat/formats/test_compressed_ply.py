@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PlayCanvas' compressed PLY: files built word by word, and round trips."""
 
 import struct

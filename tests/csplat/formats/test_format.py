@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Formats: detection, reading in blocks, writing, refusals; archives; plug-ins of other packages; notebooks.
 
 Also: csplat.archives, csplat.detect, csplat.file_source, csplat.formats.common, csplat.plugins,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """glTF with splats: files built byte by byte, round trips, refusals.
 
 Also: csplat.formats.gltf.gltf_document, csplat.formats.gltf.gltf_reader, csplat.formats.gltf.gltf_writer.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SOG, versions 1 and 2, in folders, zips and levels: files built byte by byte, and round trips.
 
 Also: csplat.formats.sog.sog_files, csplat.formats.sog.sog_reader, csplat.formats.sog.sog_writer,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """.splat and .ksplat: rows, sections, buckets and levels, read from bytes written by hand; .splat is also written.
 
 Also: csplat.formats.ksplat.

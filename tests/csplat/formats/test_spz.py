@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SPZ: every version read from bytes written by hand; damaged files are refused."""
 
 import gzip

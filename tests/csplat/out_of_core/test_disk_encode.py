@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Out-of-core encoding: the same bytes as in memory, resumed runs, full disks, lost workers.
 
 Also: csplat.out_of_core.bucket_workers, csplat.out_of_core.disk_buckets.

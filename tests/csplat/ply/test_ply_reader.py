@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PLY: columns, headers, comments and doubles, read and written; refusals; a limit of memory.
 
 Also: csplat.ply.comments.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Verification of declared errors, in memory and tile by tile, and descriptions of files.
 
 Also: csplat_conformance.declared_bounds.tile_pairs.

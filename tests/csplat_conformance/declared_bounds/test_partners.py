@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_conformance.declared_bounds.partners."""
 
 from dataclasses import replace

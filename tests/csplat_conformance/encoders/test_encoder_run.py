@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The encoder suite's runs of a program: what a program may not do, and what is kept, counted and written.
 
 Also: csplat_conformance.encoders.reference_ply, csplat_conformance.fields.

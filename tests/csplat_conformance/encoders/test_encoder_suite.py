@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The encoder suite: our encoder at every preset, faulty encoders, refusals, inputs, and the command.
 
 Also: csplat_conformance.encoders.surface_scenes.

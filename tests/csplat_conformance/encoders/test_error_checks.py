@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The encoder suite's checks of the errors that a file declares, and when renders must be compared instead.
 
 Also: csplat_conformance.encoders.render_checks.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects.
 
 Also: csplat_conformance.validator.ancillary_chunks, csplat_conformance.validator.index,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The renderer on a GPU, by an adapter that emulates one, and the layout that its shaders read.
 
 Tests of the area need wgpu (extra `gpu`) and a Vulkan driver; Debian's mesa-vulkan-drivers has one for the CPU.

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Prints hashes of what the renderer computes for made splats: images, gradients, pruning errors, sensitivities, and
 // the values after 50 steps of a refit, once for each of 1, 2 and 8 threads. All lines must be equal, on every
 // processor.

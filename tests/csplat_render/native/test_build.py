@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Building of the compiled library, the wheels with and without it, and the library under sanitizers."""
 
 import os

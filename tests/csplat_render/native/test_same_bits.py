@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Same bits of the renderer for any number of threads, on every instruction set that can be compiled and run here.
 
 `hashes.cpp` has the renders, and the steps.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat compare`: pairs of splats, scores of renders, and the definition of `psnr`.
 
 Also: csplat_render.scorer, csplat_tools.cli.compare.

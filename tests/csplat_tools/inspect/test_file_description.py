@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Descriptions of files with contents of unknown types, which no encoder writes."""
 
 from csplat import _spec

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The expected work of a search, and the progress that a real search reports by it."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simplification: views, pruning order, refits, SH bands, and the command.
 
 Also: csplat_tools.cli.simplify, csplat_tools.views.sufficient_views.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Targets: options, the command, and on real scenes the files of three searches, refits, measurements and reports.
 
 test_target_search.py tests the logic of the search on analytic scenes.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The search for a target on analytic scenes: the file it finds, and the number of candidates."""
 
 from dataclasses import replace

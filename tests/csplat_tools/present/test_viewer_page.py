@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat export-html`: one page that opens from a disk without a network and shows what the served one shows."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat view`: answers and refusals of its server, and the end of the command.
 
 Also: csplat_tools.cli.view.

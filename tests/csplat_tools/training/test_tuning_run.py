@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of csplat_tools.training.tuning_run.
 
 Also: csplat_trainer.device_measurements.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory.
 
 Also: csplat_tools.scene_files, csplat_tools.views.splat_spool.

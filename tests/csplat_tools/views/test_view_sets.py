@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training, validation and test views: none has two roles, and the same test views score the same scene alike."""
 
 import json

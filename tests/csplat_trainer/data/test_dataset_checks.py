@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lenses of data sets, images that are straightened, and sets whose sizes, lenses or poses contradict the images.
 
 Also: csplat_trainer.data.foreign_sets, csplat_trainer.data.lens.

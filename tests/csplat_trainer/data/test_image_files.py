@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images of data sets: names and the files they are found to be; values of every kind of pixel, and masks."""
 
 import json

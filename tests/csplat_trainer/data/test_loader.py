@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readers of data sets, on tiny sets.
 
 Also: csplat_trainer.data.dataset, csplat_trainer.data.transforms.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data sets read files within their folder, and others only if the user trusts them."""
 
 import os

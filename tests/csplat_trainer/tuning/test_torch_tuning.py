@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fine-tuning in torch, against the native engine.
 
 Also: csplat_trainer.torch_quantisers.

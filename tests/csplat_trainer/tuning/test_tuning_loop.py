@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command.
 
 Also: csplat_tools.cli.finetune, csplat_tools.training.tuning_report, csplat_trainer.tuning.tuning_engine,

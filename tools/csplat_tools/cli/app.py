@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The `csplat` program with all its commands. A command is imported when it is used: all take half a second."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results of a command: files, standard output, remarks and progress, as the common options specify."""
 
 from __future__ import annotations

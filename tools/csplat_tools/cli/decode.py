@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat decode`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of the command line: one line on standard error, and a status."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arguments and options that several commands share, and parsers of their values.
 
 Help texts are one line at 80 columns: what the option does, its unit, its default. Parsers raise `typer.BadParameter`

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat view`, `csplat export-html` and `csplat export-element`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compare a scene with its source: sizes, errors of splats, and scores of renders."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Describe a file without decoding it, for `csplat info`.
 
 Only the heads of the blocks of a .csplat file are read. Nothing is inflated and no CRC is computed, so that a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The HTML report on a file: `csplat info --page`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports of the inspecting commands as text: tables and lines for people."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Validate a file and verify its declared error bounds, as `csplat verify` does."""
 
 from __future__ import annotations

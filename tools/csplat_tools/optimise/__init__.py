@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the file of a scene that meets a target, over precision, coding of SH and number of splats."""

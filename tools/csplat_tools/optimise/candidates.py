@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Candidates of a search: files of a subset of the splats, with a coding of SH and a precision, each made once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prune a scene, refit the kept splats to renders of the source, and encode them: `Pruner`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The model of the search: size and error of files, by the number of splats and the precision of their values.
 
 The error of a file is the sum of the error P of pruning and the error Q of quantisation. For one coding, the logarithms

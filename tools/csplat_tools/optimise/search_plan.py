@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The expected work of searches for a target, from which their progress and their time are estimated."""
 
 from __future__ import annotations

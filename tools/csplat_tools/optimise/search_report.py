@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the report of a search for a target, and format it."""
 
 from __future__ import annotations

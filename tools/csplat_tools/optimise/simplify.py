@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`simplify`: prune splats to a target, and refit the others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Meet a target by rendering candidates; `csplat.encode` finds `meet_target` by its entry point."""
 
 from __future__ import annotations

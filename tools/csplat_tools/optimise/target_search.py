@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the smallest file that meets a PSNR or a drop of PSNR, or for the best file of a size.
 
 How a target is met:

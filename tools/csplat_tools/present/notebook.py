@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show a scene in a notebook: the page of `csplat export-html` in a frame.
 
 The page is the text of the frame (`srcdoc`), so that it is saved with the notebook and needs no server. The frame is a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Render a scene to PNG files in a folder, or to a video, as `csplat render` does."""
 
 from __future__ import annotations

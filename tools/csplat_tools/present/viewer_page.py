@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Export the viewer, the JavaScript decoder and a scene as one HTML page, or the viewer as one script.
 
 A page opened as `file:` cannot import modules from neighbouring files, and its worker cannot import at all: the origin
@@ -56,8 +57,12 @@ _IMPORT = re.compile(
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-# Lines of comments. GLSL comments in template strings are removed, too.
-_COMMENT = re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE)
+# Lines of comments by file type. GLSL comments in template strings are removed, too.
+_COMMENTS = {
+    ".mjs": re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE),
+    ".css": re.compile(r"^/\*.*\*/\n", re.MULTILINE),
+    ".html": re.compile(r"^<!--.*-->\n", re.MULTILINE),
+}
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'
 _POLICY = re.compile(r'(<meta http-equiv="Content-Security-Policy" content=")[^"]*(">)')
@@ -207,9 +212,8 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
 
 
 def _texts() -> dict[str, str]:
-    """Return the text files of viewer and decoder by path; modules without comments, which are 20 % of them."""
-    texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
-    return {path: _COMMENT.sub("", text) if path.endswith(".mjs") else text for path, text in texts.items()}
+    """Return the text files of viewer and decoder by path, without comments, which are 20 % of modules."""
+    return {path: _COMMENTS[file.suffix].sub("", file.read_text("utf-8")) for path, file in web_files().items()}
 
 
 def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:

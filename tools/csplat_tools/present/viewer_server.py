@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prepare a scene for the viewer, and serve the page, the decoder and the scene with HTTP Range.
 
 A table lists all paths that are served, so that no other file can be reached. Requests for other hosts are refused, see

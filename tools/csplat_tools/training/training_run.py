@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Train a scene from a data set, and write a PLY, or a file tuned to the same images: `csplat train`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports on a training and on a tuned file: JSON, text, and the HTML page of `csplat train` and `finetune`."""
 
 from __future__ import annotations

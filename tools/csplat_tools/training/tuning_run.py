@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encode a scene, and tune the file to images or to renders of the scene, as `csplat finetune` does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Views of a scene by role: training, validation and test."""
 
 from __future__ import annotations

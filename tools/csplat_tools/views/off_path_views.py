@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place views off the path of given cameras: between, beside and beyond them.
 
 Nothing is fitted to these views. The PSNR in them is the price of savings on what no camera sees, which views on the

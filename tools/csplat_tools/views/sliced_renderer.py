@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Render a scene that does not fit in memory, in slices of depth, using a file on the disk.
 
 For each render all splats are read once, and the visible splats are sorted into slices. Slices are drawn from front to

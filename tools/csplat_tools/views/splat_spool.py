@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Store splats in a temporary file, sorted by integer keys: slices of depth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find how many views are needed to choose splats: views are added until they agree with held-out views.
 
 A choice of splats to prune overfits its views. This can be measured without rendering the result: the predicted error

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Assign the views of a scene their roles: training, validation and test.
 
 Values are fitted to training views. Validation views decide how many splats are kept, which step is best and when a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place virtual cameras around a scene, for training and for extra tests.
 
 Training views are many and small, since many small renders overfit less than a few large renders with the same number

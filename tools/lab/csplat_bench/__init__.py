@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmarks: suites in TOML, one runner, results as JSON.
 
     python -m csplat_bench list                          # all suites

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run benchmark suites, and show their results."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages in Chromium, and a server of folders."""
 
 from __future__ import annotations

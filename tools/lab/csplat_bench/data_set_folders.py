@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark scenes below a folder, and the images that the papers use of them, by set."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encoders: functions that make a file of a scene, registered by the key that selects them in a case.
 
 command = "encode --preset fast"    # csplat's command line, in a process of its own

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Engines of others: a page in Chromium with their packages, the view of a scene, and our renders by their rules.
 
 Rules are the known differences in how an engine draws; what still differs from our renders is due to the file.

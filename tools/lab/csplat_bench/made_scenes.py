@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes made of others: copies side by side, and a given number of splats in view."""
 
 from __future__ import annotations

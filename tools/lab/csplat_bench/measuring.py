@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Clocks and memory: of calls, of calls in processes of their own, and of other programs.
 
 The growth of a process is its largest resident size during a call less its size before. On Linux the kernel's

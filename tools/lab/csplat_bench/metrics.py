@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metrics of a file: functions that return fields of its row, registered by the names that suites use.
 
 Metrics of time run in every turn, in a new process; all others once per file.

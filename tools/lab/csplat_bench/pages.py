@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generated tables and plots of the documentation: data from `results/*.json`, layout from `results/tables.toml`.
 
 A page holds a block for each table, and its lines are replaced:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Programs of others: splat-transform, which writes and reads SPZ and SOG, SPZ's C++ library, and npm packages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The protocol between the runner and the subjects of measurement."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Published figures: rows from the TOML files in `published`.
 
 A file is a table of rows by scene or set, or a list `methods` of compact blocks:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simple ways to reduce a scene, for comparison: prune by opacity, truncate SH, cluster attributes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results of a suite: a JSON file that grows row by row, with the command, the machine and the versions."""
 
 from __future__ import annotations

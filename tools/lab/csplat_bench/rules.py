@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rules that turn measurements into results: medians, paired ratios, sizes at equal PSNR, means over scenes."""
 
 from __future__ import annotations

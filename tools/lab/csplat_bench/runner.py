@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a suite: its cases take turns on every scene, and rows are medians over the turns."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes that benchmarks measure: the sample, those of the data folder, scenes made of them, and any PLY.
 
 lego60k         a PLY or SOG of the data folder

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A server with limited bandwidth, shared by all connections, and latency."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Suites: TOML files that declare scenes, cases, and the table and plot of the results.
 
 title = "Presets"

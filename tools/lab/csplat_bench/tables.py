@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables and plots of results: rows from JSON, columns as templates, Markdown and SVG out.
 
 A template is a format string over the fields of a row, such as `{size_bytes / 1e6:.2f}` or `{psnr - source.psnr:+.1f}`.

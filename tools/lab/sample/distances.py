@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Signed distances to the garden's surfaces, for ray marching; each function takes many points at once.
 
 The distance to a part is exact or slightly too short, so that no ray passes through a surface. Points are [3, P]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scene of the sample: a dish garden of moss, toadstools, daisies, grass, pebbles and a snail.
 
 An original design, made for this project and dedicated to the public domain (CC0-1.0). Lengths are

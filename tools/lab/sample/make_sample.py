@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the sample scene that ships with the project: photograph the garden, then train splats on the images.
 
 The scene is procedural (`garden.py`), rendered here (`photograph.py`), trained by `csplat_trainer`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Materials of the garden: glaze, moss, gills, gloss; each function takes many points [3, P] at once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Photographs of the garden, ray-marched and lit by a lamp and a sky.
 
 Colours depend on the view direction: highlights of the lamp and reflections of a sky with two bright windows have

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmarks: suites, the runner, rules, and every subject on a small scene."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The shipped sample scene, and its recipe on a small scale."""
 
 import sys

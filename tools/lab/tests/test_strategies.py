@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simple strategies: kept splats, sizes by hand, and verified files."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The initial view of several kinds of scenes, made of samples. It must not depend on a few far splats.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

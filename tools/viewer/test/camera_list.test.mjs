@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Sources of the up direction, and their order.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The cull keeps all visible splats and drops most others.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

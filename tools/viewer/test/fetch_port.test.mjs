@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Functions of the page that the worker calls.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

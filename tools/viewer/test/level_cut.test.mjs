@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Cuts of a scene of which only a part has arrived, and within a budget.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Files rewritten with another META: everything else is kept.
 import assert from 'node:assert/strict';
 import { readFileSync, readdirSync } from 'node:fs';

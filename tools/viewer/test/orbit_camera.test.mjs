@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The interactive camera: the position of the pivot in the picture before and after each movement.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

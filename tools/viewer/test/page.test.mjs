@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The parameters of the address, and the error messages.
 import assert from 'node:assert/strict';
 import { readdirSync } from 'node:fs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Reproducible random numbers.
 
 /** A generator of numbers in [0, 1): mulberry32. @param {number} seed */

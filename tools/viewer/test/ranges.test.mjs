@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Ranges of memory that are taken and given back.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

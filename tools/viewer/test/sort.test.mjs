@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Depth sort against a plain sort.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Texels have the decoder's values, read back as in the shaders, for every conformance vector.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';

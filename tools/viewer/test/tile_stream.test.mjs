@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The order in which a file is read, and the events on the way.
 import assert from 'node:assert/strict';
 import { readFileSync, readdirSync } from 'node:fs';

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Open a GPU through wgpu (Vulkan, Metal, Direct3D 12) and run the compute shaders of `codec/wgsl` on it."""
 
 from __future__ import annotations

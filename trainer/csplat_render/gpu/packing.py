@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pack splats into the words that the shaders read (`codec/wgsl/layout.wgsl`).
 
 A tile is a run of at most 65,536 splats with constants of its own: bits per field, offsets, steps. A splat is a string

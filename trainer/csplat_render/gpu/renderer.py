@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`GpuRenderer`: render scenes on a GPU, by screen tiles, from the integers of their files.
 
 An image is rendered in bands of rows that fit the buffers. A band is rendered in slices of depth, nearest first, that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compare the renders of two scenes on a GPU; only sums are read back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Steps of Adam for arrays; see adam.h.
 #include "adam.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Adam without weight decay (Kingma & Ba 2015, https://arxiv.org/abs/1412.6980), and the limits of values after a step.
 //
 //     mean ← b1 mean + (1 − b1) g

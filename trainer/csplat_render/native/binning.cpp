@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Binning: a radix sort of the drawn splats by depth, then a stable counting sort into tiles, the order of blending.
 //
 // Chunks of the depth order are fixed, and each writes to a range that a prefix sum over all chunks has reserved. Each

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Blending of the splats of a tile, front to back, and passes over the same splats back to front; vectorised over
 // squares of 4 × 4 pixels.
 //

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile the library, a file for each instruction set, unless these files are up to date.
 
     python build.py [FOLDER] [--sanitize address,undefined] [--sets avx2,portable]

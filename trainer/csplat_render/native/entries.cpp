@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The nearest entries of a codebook: of all, or of those in groups whose centres are near.
 //
 // |x − c|² is |x|² − s with the score s = x·2c − |c|², so the nearest entry has the highest score. All numbers are

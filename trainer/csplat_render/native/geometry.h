@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The projection of a Gaussian, which the forward and the backward pass share; equations in projection.cpp.
 #pragma once
 

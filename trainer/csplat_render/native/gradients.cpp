@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The gradient of a loss with respect to the splats, and a step of Adam along it.
 //
 // Blending, back to front; parallel over tiles. With g the gradient of the loss at a pixel and `behind` the part of

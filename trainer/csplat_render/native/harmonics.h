@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The real spherical harmonics of degrees 0 to 4 and their gradient, as csplat.spherical_harmonics, for lanes of
 // directions.
 #pragma once

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // SSIM, the photometric loss with its gradient, and the convolution of LPIPS.
 //
 // With E the mean over the window, a Gaussian of 11×11 pixels, σ 1.5, with zeros beyond the border, SSIM of a value is

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Functions about the library itself. Compiled for any processor, so that an unsupported one can call them.
 #include "library.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The interface to Python: C functions that take pointers to arrays, 64-bit integers and doubles; see kernels.py.
 //
 // The first argument of a function that runs on threads is their number. Each returns a result of at least 0, or −1 if

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The nearest neighbours of points in space.
 //
 // A balanced k-d tree: each node halves its points along the longest side of their box, by coordinate and then by row,

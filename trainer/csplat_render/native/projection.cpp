@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Projection of splats to ellipses on the image; parallel over blocks, vectorised over the 16 splats of a block.
 //
 // With R and t the rotation and translation of the camera, r_k the axes of the splat and s_k its standard deviations:

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The squared change of a render without each splat; parallel over tiles.
 //
 // At a pixel, a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour and B

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Quantisers of a file, for steps of fine-tuning through them: decoded values, sums of gradients over the splats of a
 // codebook entry, and slopes of the rate term.
 //

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The pass that blends an image, all splats at once or slice by slice of depth; parallel over tiles.
 #include "blending.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The splats of a view, from the projection to the sums over pixels: data and memory that the passes share.
 #pragma once
 

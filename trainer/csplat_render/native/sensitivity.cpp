@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Sums over the pixels of a view of the derivatives of its render with respect to each splat; the equations are at the
 // top of csplat_trainer.sensitivity.
 //

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The tiles that the ellipse of a splat touches, a span for each row of tiles.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Small kernels of training: images in front of a background, noise of splats, pairs of splats.
 #include <algorithm>
 #include <cmath>

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Vectors of floats and of four doubles with strict arithmetic, which gives the same bits on every processor.
 //
 // Data is laid out in blocks of 16 lanes. A block is one AVX-512 register of floats, two AVX2 registers, or four NEON

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The types and operations of vectors.h by the vector types of GCC and Clang, which lower them to NEON, or to any other
 // instruction set. Same bits as vectors_x86.h.
 #pragma once

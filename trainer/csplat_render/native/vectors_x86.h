@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The types and operations of vectors.h for AVX2 with FMA, and for AVX-512.
 #pragma once
 

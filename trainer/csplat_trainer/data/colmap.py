@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """COLMAP sets: a sparse model, binary or text, next to folders of images.
 
     images/ images_2/ images_4/ images_8/     the same images, smaller and smaller

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data sets, and functions shared by their readers: unread shots, splits, undistorted images, point clouds."""
 
 from __future__ import annotations

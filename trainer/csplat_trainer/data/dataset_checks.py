@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks of a data set's consistency: sizes, lenses, poses; and notes on the interpretation of its files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recognise data sets of programs whose files are not read, so that the message names the program and the way out."""
 
 from __future__ import annotations

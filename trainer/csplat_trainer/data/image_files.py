@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Find the image files that a data set names.
 
 Poses are often computed on another machine, so names may differ in separators, suffixes, case and folders. A name is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Image files: headers, pixels as RGB or RGBA in 8 bits, and values of masks.
 
 Every pixel format of the files that `open_image` opens is converted, or refused by name:

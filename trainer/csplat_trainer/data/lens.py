@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lenses: the position of an undistorted image's pixel in the original, and the pinhole of the undistorted image.
 
 A lens maps directions (x, y), with z = 1 ahead, to the image plane in two steps: a projection (perspective, equidistant

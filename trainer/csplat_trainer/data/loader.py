@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`load`: recognise a data set, read it, choose its origin and axes, and report findings."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`SetFolder`: the folder that a data set may read. Names, masks, points and links that lead out of it are refused."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readers of `transforms*.json`: sets of NeRF-synthetic (Blender), instant-ngp and nerfstudio.
 
 Both hold camera-to-world matrices with OpenGL axes: x to the right, y up, z backwards.

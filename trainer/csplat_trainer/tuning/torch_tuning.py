@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # torch may be absent:
 # pyright: reportMissingImports=false
 """Steps of fine-tuning in torch, with the interface of `CpuTuning`: on a GPU, and as a reference on a CPU.

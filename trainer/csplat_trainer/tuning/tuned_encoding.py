@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`finetune`: encode a scene, tune the values of the file to views, and code them with the same decisions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steps of fine-tuning: render decoded values, compare, and move the values of the file; on the CPU, without torch."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`tune`: optimise the values of a fixed quantisation until renders of its file match the reference images.
 
 For a target size, `RateController` adjusts lambda, the loss per bit and splat, to the number of bits.

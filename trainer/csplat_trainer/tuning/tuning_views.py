@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The views of fine-tuning, with images of a data set or renders of the source."""
 
 from __future__ import annotations

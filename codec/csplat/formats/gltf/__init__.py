@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """glTF 2.0 with the extension KHR_gaussian_splatting (ratified in 2026): .glb, and .gltf with its buffers.
 
 glTF specifies that y is up, that models face +z, and that +x points to their left: LUF. Metadata for which glTF has no

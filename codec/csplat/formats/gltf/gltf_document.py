@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The parts of glTF 2.0 that splats need: containers, buffers, accessors and the transforms of nodes.
 
 Files are not trusted: every index, length and number is checked before it is used. A violation of glTF raises an

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read splats from glTF: accessors of KHR_gaussian_splatting, or SPZ under any name that its extension has had.
 
 Everything that splats do not use (meshes, materials, their compression) is ignored, even required extensions.

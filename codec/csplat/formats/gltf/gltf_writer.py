@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write glTF 2.0 with the extension KHR_gaussian_splatting as a single .glb file."""
 
 from __future__ import annotations

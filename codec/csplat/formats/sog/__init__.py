@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SOG: splat attributes as lossless WebPs with a meta.json, in a folder or zip; streamed SOG has several, in levels."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find the files of a SOG in a folder or zip, and read its JSON; neither is trusted."""
 
 from __future__ import annotations

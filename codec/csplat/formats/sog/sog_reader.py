@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read SOG, versions 1 and 2, and levels of streamed SOG.
 
 A byte of an image interpolates between two bounds in version 1, and indexes a codebook in version 2. Follows

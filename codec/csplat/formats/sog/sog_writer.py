@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write SOG, version 2, deterministically; codes are rounded, not truncated."""
 
 from __future__ import annotations

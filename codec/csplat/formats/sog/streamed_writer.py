@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write streamed SOG, version 1: a scene in levels of detail, which viewers load part by part.
 
 Follows https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog. A binary tree cuts space

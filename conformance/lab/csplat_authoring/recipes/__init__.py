@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Recipes of all vectors, both declared (`declaration`) and computed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """DEFLATE streams at the limits of section 6.2: just valid and just invalid."""
 
 from __future__ import annotations

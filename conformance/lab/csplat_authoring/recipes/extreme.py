@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Computed valid files at the limits: codebooks, streams, texts, integers of all widths."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Computed invalid files: with changed bytes, or too large to declare."""
 
 from __future__ import annotations

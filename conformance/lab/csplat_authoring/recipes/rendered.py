@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Rendered scenes and their cameras."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """JSON texts and declared errors: valid ones, and invalid ones that violate one rule each."""
 
 from __future__ import annotations

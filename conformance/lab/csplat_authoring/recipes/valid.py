@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Computed valid files: streams, codebooks, tiles, the longest records, and combinations of features."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Damage files according to their structure, for fuzzing, and repair the checksums afterwards.
 
 A file is damaged in two steps. First, fields and bytes are overwritten in place. Then, in some cases, one chunk changes

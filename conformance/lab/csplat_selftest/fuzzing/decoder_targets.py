@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Targets of the fuzzer: the decoders in Python, JavaScript and C, and the validator."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Record the executed edges between lines of Python files, to guide the fuzzer and for its report."""
 
 from __future__ import annotations

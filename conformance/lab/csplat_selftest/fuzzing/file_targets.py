@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Targets of the fuzzer: the readers of PLY and of other formats, and ways to damage their files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Mutate single operators of a decoder or a package, and list the mutants that vectors or tests miss.
 
 Usage:

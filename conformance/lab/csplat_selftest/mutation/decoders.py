@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Our decoders and their mutants: Python, JavaScript and C."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Mutants of a decoder, and their results with vectors and fuzzed files."""
 
 from __future__ import annotations

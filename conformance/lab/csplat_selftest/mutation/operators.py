@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Mutation operators: small changes of Python by syntax tree, and of C by tokens."""
 
 from __future__ import annotations

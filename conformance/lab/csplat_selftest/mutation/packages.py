@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: CC0-1.0
 """Mutants of a package, judged by the tests that reach them.
 
 Coverage lists once which tests reach which lines, function by function. Each mutant is written into a copy of the

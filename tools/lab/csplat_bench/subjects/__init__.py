@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subjects of measurement: one module for each, registered here by the name that suites use."""
 
 from __future__ import annotations

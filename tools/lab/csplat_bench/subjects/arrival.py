@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes that arrive over a slow line: milliseconds and bytes until they can be seen, in several viewers.
 
 A case has a `viewer` (a page of subjects/pages) and a `form` of the file, all forms made from the same PLY. Options:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`csplat batch` on small scenes, some of them invalid, compared with a shell loop; interrupted midway and resumed.
 
 Options: `count` scenes, of which `invalid` are not valid, of `splats` splats each; they are parts of the scene, in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The viewer in Chromium, Firefox and WebKit: seconds from the address to a complete frame.
 
 A case has a `browser` and a `place`: view (`csplat view`), folder or http (an exported page). Another file that is then

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The benchmark scenes that papers report, trained and scored by their protocols, then encoded or tuned, and scored.
 
 Scenes are found below the folder of `--data` (see `data_set_folders`). Option `train` holds TrainOptions, `size` a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Python and the JavaScript decoder, compared bit by bit: SHA-256 of every array, floats and integers.
 
 A scene is a PLY, encoded with the case's `preset`, or the path of a .csplat file. The float arrays of spec 3, the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decoders of ours and of others: seconds from bytes in memory to arrays, all checks included, and memory.
 
 All decoders of a scene are started first, each in a process or page of its own that holds its file, and take turns.

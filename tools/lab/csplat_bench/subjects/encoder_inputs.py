@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference inputs of the encoder conformance suite: bytes and quality of csplat's presets and of SPZ.
 
 A scene is the name of an input, or a pattern of names. A case has a `preset`, or `peer = "spz"`. SPZ is written and

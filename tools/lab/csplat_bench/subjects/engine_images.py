@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of csplat in the programs that formats are made for: three.js, PlayCanvas, Babylon.js, Spark.
 
 A case has an `engine` and a `format`. The engine's own loader (of .csplat: `codec/js/engines`) reads the file in

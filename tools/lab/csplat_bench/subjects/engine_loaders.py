@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loaders of .csplat in engines: their memory, and how they handle aborted loads and damaged files.
 
 A case is an `engine`; files are encoded with preset balanced and served by this machine to Chromium, 320 by 240.

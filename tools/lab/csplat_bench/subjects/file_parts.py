@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parts of a file: how much is read for them, and how soon they are there, from the disk, by HTTP, from an S3.
 
 The part is a cube in the middle of the scene, so wide that the tiles that touch it hold the option `share` of the

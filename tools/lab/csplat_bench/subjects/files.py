@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of a scene: bytes, quality, time and memory of encoders, ours and those of others.
 
 Options: `metrics`, names of `metrics.METRICS`; `views`, as in `Scene.scorer`. Default: given.

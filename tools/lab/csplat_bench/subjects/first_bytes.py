@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The first bytes of a file: what a viewer can show of them, next to the finished scene.
 
 A case has `levels`, true if the file has levels of detail, and `share`, the fraction of the file that has arrived; or

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The renderer on the GPU: milliseconds of each stage and GPU memory, for packed files and float models; and gsplat.
 
 A case has a `layout`: `packed`, the integers of a file; `floats`, its decoded values; or `gsplat`, gsplat's kernels on

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled library: milliseconds per view or step of what searches and training repeat.
 
 A case has a `work`: `render`, `pruning` (the pruning errors of all splats), `refit` and `quantised_refit` (steps of the

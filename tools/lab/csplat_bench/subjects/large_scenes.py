@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands on scenes that do not fit the memory: seconds, the memory of all their processes, and the bytes they write.
 
 A case's `command` is a csplat command line with `{scene}`, `{file}` (the encoded scene) and `{back}` (a decoded PLY);

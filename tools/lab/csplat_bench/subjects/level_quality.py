@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
 A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;

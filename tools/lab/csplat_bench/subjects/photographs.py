@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files made from photographs: trained, tuned, scored on held-out photographs, next to published figures.
 
 A scene is a data set: a folder in the data folder, or its path; option `sizes` gives widths and heights by scene.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The renderer: milliseconds of a render and of its gradients, and the PSNR of the other modes.
 
 A case has a `mode`, and perhaps `antialiased`. Values are medians over the scene's cameras (640 by 480; the data

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steps of training: milliseconds by stage, and memory, in a process of its own.
 
 Stages are the forward pass, the loss, and `descend`, the gradients with the step of Adam.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The viewer's engine in Chromium: milliseconds of culling, sorting and drawing, memory on the GPU.
 
 A case is a `preset`. Without option `gpu`, SwiftShader draws, a GL on the CPU, whose frames say nothing about a GPU's.

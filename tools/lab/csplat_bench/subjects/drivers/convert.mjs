@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // node convert.mjs NAME: converts NAME.ply to NAME.ksplat, and NAME.spz of any version to NAME.v2.spz, .v3.spz, .v4.spz.
 // The formats' owners write them, with their defaults: SH of SPZ in 5 and 4 bits, KSPLAT of level 1.
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* csplat FILE THREADS: prints "ready", then decodes once for each input line and prints seconds and bytes of arrays.
  * Each thread opens the file, and they share its tiles. */
 #include "csplat.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Ways to decode in JavaScript, for Node and pages. An export returns, once it is ready, a function of a file's bytes.
 
 import { CsplatReader, decode } from '../../../../../codec/js/decoder.mjs';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // node --expose-gc node.mjs MODULE EXPORT FILE: prints "ready", then decodes once for each input line.
 
 import { readFileSync } from 'node:fs';

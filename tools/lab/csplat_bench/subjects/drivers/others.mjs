@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Decoders of others in JavaScript, bundled for Node and pages; exports as in csplat.mjs. Each loads only its own package.
 
 const geometry = (loader) => async (bytes) => {

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """serve.py FILE THREADS: print "ready", then decode once for each input line; print seconds and bytes of arrays."""
 
 import sys

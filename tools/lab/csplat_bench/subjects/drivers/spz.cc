@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // spz FILE floats|packed: prints "ready", then decodes once for each input line and prints seconds and bytes of arrays.
 #include "load-spz.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // spz_encode SCENE.ply FILE.spz: encodes once, prints wall and CPU seconds from floats to bytes.
 #include "load-spz.h"
 

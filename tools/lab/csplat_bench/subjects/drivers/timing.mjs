@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Times one decoding: [seconds, bytes of all arrays]. A gc() in between would discard compiled code.
 
 export async function once(decode, bytes) {

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Records what a viewer shows while a scene arrives: small images of its canvas and their times.
 // `begin` does not wait; `state` reports progress, `pictures` returns the images.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Babylon.js: its loaders append to a scene whose world has left-handed axes, the default.
 import '@babylonjs/core/Loading/loadingScreen.js';
 import { FreeCamera } from '@babylonjs/core/Cameras/freeCamera.js';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The viewer of this project: its engine alone, on a canvas.
 import { createEngine } from '/tools/viewer/engine.mjs';
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // PlayCanvas: a component with an asset; SPZ by the parser in its package.
 import * as pc from 'playcanvas';
 import { CsplatParser } from 'csplat-decoder/playcanvas';

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Spark on three.js: its own loader, and the adapter for .csplat.
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
 import { loadCsplat } from 'csplat-decoder/spark';

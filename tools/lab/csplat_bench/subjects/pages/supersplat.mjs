@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The viewer of SuperSplat, in an element of its own: it takes scenes in a PLY's axes and rotates them about z.
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer.js';
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // three.js: GaussianSplat and its loaders. Colours pass unchanged: three takes SH colours for linear light.
 import * as THREE from 'three';
 import { CSPLATLoader } from 'csplat-decoder/three';

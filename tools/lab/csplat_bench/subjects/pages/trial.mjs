@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // An engine on a canvas, and loads that succeed, fail or are aborted. GPU memory is counted from the calls to WebGL, so
 // that this module must be imported before the engine.
 
