@@ -184,12 +184,23 @@ function checkCounts(head, index, limits) {
     head.tile_count * head.tile_size;
   if (least > index.left)
     throw fault(ERROR_INDEX, at, 'IDX-2', `records of at least ${least} bytes, ${index.left} are left`);
-  if (index.bytes.length * INDEX_GROWTH > limits.bytes) {
+  checkIndexBudget(index.bytes.length, limits);
+}
+
+/**
+ * Compare the memory of the parsed index with the budget, for clients before they request the index.
+ *
+ * @param {number} size bytes of the index
+ * @param {Required<Limits>} limits
+ * @throws {FormatError} E_LIMIT
+ */
+export function checkIndexBudget(size, limits) {
+  if (size * INDEX_GROWTH > limits.bytes) {
     throw fault(
       ERROR_LIMIT,
       spec.HEADER_OFFSETS.index_size,
       'LIM-1',
-      `an index of ${index.bytes.length} bytes, the budget is ${limits.bytes / INDEX_GROWTH}`,
+      `an index of ${size} bytes, the budget is ${limits.bytes / INDEX_GROWTH}`,
     );
   }
 }

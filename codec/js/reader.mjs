@@ -13,7 +13,7 @@ import { readTable, tableBytes } from './codebooks.mjs';
 import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { FormatError, InputError } from './errors.mjs';
-import { readIndex } from './file_index.mjs';
+import { checkIndexBudget, readIndex } from './file_index.mjs';
 import { checkedInflate, platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed_layers.mjs';
@@ -105,6 +105,7 @@ export class Reader {
       if (known !== Infinity) checkFileSize(known, file);
       progress.fileSize = file.fileSize;
       opening.set(0, head);
+      checkIndexBudget(file.indexSize, limits);
       const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
       const header = readIndex(index, file, limits);
       opening.set(spec.HEADER_SIZE, index);

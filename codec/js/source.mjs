@@ -10,6 +10,7 @@ import { BlobSource, CallerSource, MemorySource, WholeSource, cutShort, shortDat
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
+const UNSEEN_BYTES = 1 << 24; // memory of an answer before its bytes arrive; more grows with them
 const TINY_BYTES = 256; // an answer to a longer range with fewer bytes is no progress
 const TINY_ANSWERS = 16; // in a row after which the server is asked for the whole file
 
@@ -231,7 +232,7 @@ export class HttpSource {
   async #collect(start, end, signal) {
     const { transport } = this;
     const tries = transport.tries(signal);
-    const bytes = new Uint8Array(end - start);
+    let bytes = new Uint8Array(Math.min(end - start, UNSEEN_BYTES));
     let filled = 0;
     let tiny = 0;
     for (;;) {
@@ -248,6 +249,7 @@ export class HttpSource {
         if (answer.take !== 'part') continue;
         for await (const part of answer.body.parts()) {
           const taken = part.subarray(0, until - start - filled);
+          if (filled + taken.length > bytes.length) bytes = longer(bytes, filled + taken.length, end - start);
           bytes.set(taken, filled);
           transport.count(start + filled, start + filled + taken.length);
           filled += taken.length;
@@ -319,6 +321,20 @@ async function readNow(transport, start, end) {
     if (filled === bytes.length) break;
   }
   return filled === bytes.length ? bytes.subarray(start - end) : null;
+}
+
+/**
+ * Copy the bytes of an answer to a longer array, of twice the length unless all of the answer is shorter.
+ *
+ * @param {Bytes} bytes
+ * @param {number} least
+ * @param {number} most
+ * @returns {Bytes}
+ */
+function longer(bytes, least, most) {
+  const copy = new Uint8Array(Math.min(most, Math.max(least, 2 * bytes.length)));
+  copy.set(bytes);
+  return copy;
 }
 
 /**

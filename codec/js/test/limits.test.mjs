@@ -3,9 +3,11 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
+import { CRC_SIZE, crc32 } from '../checksums.mjs';
 import { tableBytes } from '../codebooks.mjs';
 import { CsplatReader, LimitError, decode, readHeader } from '../decoder.mjs';
-import { hash, manifest, refusal, vector } from './helpers.mjs';
+import { HEADER_OFFSETS, HEADER_SIZE } from '../spec.mjs';
+import { forged, hash, manifest, refusal, serve, vector } from './helpers.mjs';
 
 const rich = vector('valid/rich');
 
@@ -49,9 +51,41 @@ test('a budget of JSON counts the bytes and the values of the text', async () =>
     assert.equal((await refusal(() => decode(file, { limits: { jsonBytes } }))).clause, 'STR-8', `${jsonBytes}`);
 });
 
-test('an index beyond the budget is refused before its records are read', async () => {
-  const error = await refusal(() => readHeader(rich, { limits: { bytes: 1000 } }));
-  assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
+test('an index beyond the budget is refused before its records are read, or requested', async (t) => {
+  const { url, requests } = await serve(t, rich);
+  const options = { limits: { bytes: 1000 }, firstBytes: 32 };
+  for (const read of [() => readHeader(rich, options), () => CsplatReader.open(url, options)]) {
+    const error = await refusal(read);
+    assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
+  }
+  assert.deepEqual(requests, ['bytes=0-31']);
+});
+
+test('the bytes of a long answer are complete, and a short one takes no memory of the announced size', async () => {
+  const size = 40_000_001;
+  const header = forged(rich, (_, view) => {
+    view.setUint32(HEADER_OFFSETS.index_size, size, true);
+    view.setBigUint64(HEADER_OFFSETS.file_size, BigInt(HEADER_SIZE + size), true);
+  }).subarray(0, HEADER_SIZE);
+  const file = new Uint8Array(HEADER_SIZE + size).map((_, i) => header[i] ?? i ** 2);
+  const open = (sent, status = 206) =>
+    refusal(() =>
+      CsplatReader.open('http://example.test/x.csplat', {
+        retries: 0,
+        fetch: async (_, { headers }) => {
+          const [start, last] = /(\d+)-(\d+)/.exec(new Headers(headers).get('range')).slice(1).map(Number);
+          const end = Math.min(last + 1, sent.length);
+          if (start >= end) return new Response(null, { status: 503 });
+          const range = `bytes ${start}-${end - 1}/${file.length}`;
+          return new Response(sent.subarray(start, end), { status, headers: { 'content-range': range } });
+        },
+      }),
+    );
+  const computed = crc32(file.subarray(HEADER_SIZE, -CRC_SIZE)).toString(16);
+  assert.match((await open(file)).message, new RegExp(`IDX-1.*computed 0x0*${computed}`));
+  const before = process.memoryUsage().arrayBuffers;
+  await open(file.subarray(0, 100_000));
+  assert.ok(process.memoryUsage().arrayBuffers < before + 30e6);
 });
 
 for (const name of ['extreme/seeded', 'valid/sh_degree_4_mixed']) {
