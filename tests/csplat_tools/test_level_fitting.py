@@ -12,7 +12,8 @@ from csplat.scene import join_blocks
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_fitting import LevelFitter, Work, make_backdrop
-from csplat_tools.level_merging import light_of, merge_neighbours
+from csplat_tools.level_merging import merge_neighbours
+from csplat_trainer.merging import light_of
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,10 @@ from csplat.scene import join_blocks
 from csplat.types import F16, I64, null_progress
 from csplat_render.camera import Camera, resized
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.level_merging import light_of, merge_neighbours
+from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.planned_progress import STEP_COST, PlannedWork, view_cost
 from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_on_part
+from csplat_trainer.merging import light_of
 from csplat_trainer.pruning import ROUND_FRACTION, MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 

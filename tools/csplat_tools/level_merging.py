@@ -11,14 +11,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from csplat.encoder import covariance_entries, mean_axes
+from csplat.encoder import covariance_entries
 from csplat.model import SplatModel
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64
 from csplat_render import kernels
 from csplat_render.neighbours import nearest_neighbours
+from csplat_trainer.merging import average_pairs, light_of, mean_areas, with_values
 
 #: Neighbours with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long.
 NEIGHBOURS = 8
@@ -35,7 +35,6 @@ _OPACITY_MAX = 0.99  # alpha that renderers cap at
 _THINNEST = 1e-3  # least standard deviation, divided by the largest, so that a flat splat has an image from the side
 _SINGULAR = 1e-12  # least determinant of a covariance, divided by the product of its variances
 _BLOCK = 1 << 14  # edges at once, so that temporary arrays stay in the cache
-_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # row and column of each entry of a covariance
 _VIEWS = (((0, 1), (0, 3, 1)), ((0, 2), (0, 4, 2)), ((1, 2), (1, 5, 2)))  # axes of an image, entries of its covariances
 _TINY = np.finfo(np.float64).tiny
 
@@ -180,44 +179,10 @@ def _merge_pairs(splats: SplatModel, pairs: I64) -> SplatModel:
         splats: [N] splats, which are not changed.
         pairs: [2, P], rows of two splats; no splat is in two pairs.
     """
-    two = [splats.select(rows) for rows in pairs]
-    light = [light_of(part) for part in two]
-    share = light[0] / (light[0] + light[1])
-
-    def averaged(first: NDArray[np.floating], second: NDArray[np.floating]) -> F64:
-        """Return the averages of [P, ...] values, weighted by light."""
-        weights = share.reshape(-1, *[1] * (first.ndim - 1))
-        return np.asarray(weights * first + (1.0 - weights) * second)
-
-    offsets = (two[1].means.astype(np.float64) - two[0].means).T
-    own_covariances = [covariance_entries(part.quats.T, np.exp(2.0 * part.scales.astype(np.float64)).T) for part in two]
-    between = np.stack([offsets[i] * offsets[j] for i, j in _AXES]) * (share * (1.0 - share))  # covariance of centres
-    covariances = averaged(own_covariances[0].T, own_covariances[1].T).T + between
-    trace = np.maximum(covariances[:3].sum(axis=0), _TINY)
-    quats, scales = mean_axes(covariances / trace)
-    scales = (scales + 0.5 * np.log(trace)[:, None]).astype(np.float32)
-    opacities = (light[0] + light[1]) / _areas(scales)
+    values = average_pairs(splats, pairs)
+    scales = values["scales"]
+    opacities = light_of(splats)[pairs].sum(axis=0) / mean_areas(scales.astype(np.float32))
     growth = np.maximum(opacities / _OPACITY_MAX, 1.0) ** _GROWTH
-    values: dict[str, NDArray[np.floating]] = {
-        "means": averaged(two[0].means, two[1].means),
-        "quats": quats,
-        "scales": scales + 0.5 * np.log(growth)[:, None],
-        "opacities": np.minimum(opacities, _OPACITY_MAX),
-        "sh0": averaged(two[0].sh0, two[1].sh0),
-        "shN": averaged(two[0].shN, two[1].shN),
-    }
-    changed = {name: getattr(splats, name).copy() for name in values}
-    for name, array in values.items():
-        changed[name][pairs[0]] = array
-    return replace(splats, **changed)
-
-
-def light_of(splats: SplatModel) -> F64:
-    """Return opacity × area of each splat, above 0."""
-    return np.maximum(splats.opacities * _areas(splats.scales), _TINY)
-
-
-def _areas(scales: F32) -> F64:
-    """Return the areas [N] of projections of ellipsoids [N, 3], mean over directions, up to a factor (Knud Thomsen)."""
-    a, b, c = np.exp(scales.astype(np.float64)).T
-    return np.asarray((a * b + a * c + b * c) / 3.0)
+    values["scales"] = scales + 0.5 * np.log(growth)[:, None]
+    values["opacities"] = np.minimum(opacities, _OPACITY_MAX)
+    return with_values(splats, pairs[0], values)

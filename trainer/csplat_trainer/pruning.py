@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pruning order of splats: by the exact error of removing each from renders, measured again in rounds.
 
-Pruned splats may have hidden others, so that errors change. Targets, `simplify`, fine-tuning and training use this
-order.
+Pruned splats may have hidden others, so that errors change. Splats that are alike may be merged instead, in the order
+of both errors. Targets, `simplify`, fine-tuning and training use this order.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from csplat.model import SplatModel
 from csplat.types import F16, F32, F64, I64, Mask, null_progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
+from csplat_render.kernels import call
 from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_trainer.merging import find_alike, merge_alike
 
 #: Fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB.
 ROUND_FRACTION = 0.72
@@ -86,9 +88,11 @@ class PruningOrder:
         groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
             measurements of the others: two groups give twice the views at the cost of a single group.
         background: background colour of the views.
+        merges: merge splats into others that are alike if that has a smaller error than pruning them.
         context: threads and progress.
         rows: [G] int64, indices of splats in the order of pruning.
-        errors: [G], mean squared error of removing each from the renders, measured in its round.
+        partners: [G] int64, index of the splat into which each is merged, or −1.
+        errors: [G], mean squared error of removing each from the renders, measured in its round; estimated for merges.
         rounds: number of pruned splats by round.
         view_count: number of renders in which errors were measured again.
         seen: [N] bool, True for splats that are visible in a view.
@@ -97,8 +101,10 @@ class PruningOrder:
     model: SplatModel
     groups: list[MeasuredViews]
     background: ArrayLike = (0.0, 0.0, 0.0)
+    merges: bool = False
     context: Context = DEFAULT_CONTEXT
     rows: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
+    partners: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
     errors: F64 = field(default_factory=lambda: np.zeros(0), init=False)
     rounds: list[int] = field(default_factory=list, init=False)
     view_count: int = field(default=0, init=False)
@@ -125,6 +131,24 @@ class PruningOrder:
         is_kept[self.rows[: len(self.model) - count]] = False
         return np.flatnonzero(is_kept)
 
+    def merge(self, splats: SplatModel, rows: I64, done: int, pruned_count: int) -> SplatModel:
+        """Return splats with the values that they have once others were merged into them.
+
+        Args:
+            splats: splats of which the first `done` of the order were pruned or merged.
+            rows: ascending indices of these splats in the scene.
+            pruned_count: number of splats of the order that are to be pruned or merged.
+        """
+        begin = 0
+        for count in self.rounds:  # the pairs of a round have no splat in common
+            part = slice(max(done, begin), min(pruned_count, begin + count))
+            begin += count
+            pairs = np.stack([self.partners[part], self.rows[part]])
+            pairs = pairs[:, pairs[0] >= 0]
+            if pairs.size:
+                splats = merge_alike(splats, np.searchsorted(rows, pairs))
+        return splats
+
     def extend(self, *, kept_count: int | None = None, error: float = math.inf) -> None:
         """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
@@ -147,7 +171,8 @@ class PruningOrder:
         self._value_rows, self._values = self.kept(len(refitted)), refitted
         assert len(self._value_rows) == len(refitted)
         self._left = self._value_rows
-        self.rows, self.errors = self.rows[:pruned_count], self.errors[:pruned_count]
+        for name in ("rows", "partners", "errors"):
+            setattr(self, name, getattr(self, name)[:pruned_count])
         ends = np.minimum(np.cumsum(self.rounds), pruned_count)
         self.rounds = [int(count) for count in np.diff(ends, prepend=0) if count]
         before = np.cumsum([0, *(len(group.cameras) for group in self.groups[:-1])])
@@ -176,17 +201,56 @@ class PruningOrder:
         self._is_measured = False
         pruning_error = total_error(self.groups)
         keys = pruning_keys(self._values.opacities[places], pruning_error)
+        pairs = self._choose_merges(places, keys) if self.merges else np.zeros((2, 0), np.int64)
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]
         if not len(order):
             return False
+        partners = np.full(len(keys), -1)
+        partners[pairs[1]] = self._left[pairs[0]]
         self.rows = np.concatenate([self.rows, self._left[order]])
+        self.partners = np.concatenate([self.partners, partners[order]])
+        pairs = pairs[:, np.isin(pairs[1], order)]
+        if pairs.size:
+            self._values = merge_alike(self._values, places[pairs])
+            self.groups = [
+                replace(group, pruning_error=_merged_error(group.pruning_error, pairs)) for group in self.groups
+            ]
         self.errors = np.concatenate([self.errors, np.maximum(keys[order], 0.0) / pruning_error.value_count])
         self.rounds.append(len(order))
         kept = np.delete(np.arange(len(keys)), order)
         self._left = self._left[kept]
         self.groups = [replace(group, pruning_error=group.pruning_error.of_rows(kept)) for group in self.groups]
         return True
+
+    def _choose_merges(self, places: I64, keys: F64) -> I64:
+        """Choose splats to merge, and set the keys of both: that of the merge, and infinity for the splat that stays.
+
+        Args:
+            places: [L], places of the splats that are left among the values.
+            keys: [L], keys by which they are pruned, changed in place.
+
+        Returns:
+            [2, P], of each pair the splat that stays, and the splat that is merged into it; no splat is in two pairs.
+        """
+        pairs, mismatch = find_alike(self._values.select(places))
+        smaller = keys[pairs].min(axis=0)
+        is_possible = (smaller > 0.0) & np.isfinite(keys[pairs].max(axis=0))  # without an error, pruning is better
+        pairs = np.ascontiguousarray(pairs[:, is_possible])
+        errors = (mismatch * smaller)[is_possible]
+        chosen = np.full(len(keys), -1)
+        call("pair_up", pairs, np.argsort(errors, kind="stable"), len(errors), len(keys), chosen)
+        is_chosen = chosen[pairs[0]] == pairs[1]
+        pairs = pairs[:, is_chosen]
+        keys[pairs[0]], keys[pairs[1]] = np.inf, errors[is_chosen]
+        return pairs
+
+
+def _merged_error(pruning_error: PruningError, pairs: I64) -> PruningError:
+    """Return the errors after merges, until they are measured again: images of two splats that are alike add up."""
+    error = pruning_error.error.copy()
+    error[pairs[0]] = np.square(np.sqrt(error[pairs]).sum(axis=0))
+    return replace(pruning_error, error=error)
 
 
 def total_error(groups: Sequence[MeasuredViews]) -> PruningError:

@@ -97,7 +97,9 @@ class Pruner:
     @cached_property
     def order(self) -> PruningOrder:
         """The pruning order."""
-        return PruningOrder(self.source, [*self.measured], self.views.background, context=self.context)
+        return PruningOrder(
+            self.source, [*self.measured], self.views.background, merges=self.refits, context=self.context
+        )
 
     @cached_property
     def cameras(self) -> Sequence[Camera]:
@@ -171,14 +173,13 @@ class Pruner:
         if self._to_order is not None and kept_count < len(self._to_order):
             self.order.continue_with(self._to_order)
         rows = self.order.kept(kept_count)
-        pruned = self.source.select(rows)
+        everything = np.arange(len(self.source))
+        pruned = self.order.merge(self.source, everything, 0, len(self.source) - len(rows)).select(rows)
         psnr_pruned = self.check_scorer.psnr(pruned)
         if not self.refits or len(rows) == len(self.source):
             self._last = PrunedSubset(self, pruned, rows, psnr_pruned, psnr_pruned, refit_refused=False)
             return self._last
-        start = pruned
-        if self._last is not None:
-            start = _with_values_of(self._last.model, self._last.rows, pruned, rows)
+        start = pruned if self._last is None else self._with_last_values(self._last, pruned, rows)
         refitted = refit_splats(
             start, self.cameras, self.references, steps=self.scaled_steps(part * _STEPS),
             background=self.views.background, context=self.context,
@@ -192,6 +193,21 @@ class Pruner:
         if part == _BRIEF:
             self.order.continue_with(model)
         return self._last
+
+    def _with_last_values(self, last: PrunedSubset, pruned: SplatModel, rows: I64) -> SplatModel:
+        """Return splats with the values of an earlier refit, merged further, but for partners of splats that return.
+
+        Args:
+            last: the refitted splats.
+            pruned: the splats.
+            rows: their indices in the source.
+        """
+        done, pruned_count = len(self.source) - len(last.rows), len(self.source) - len(rows)
+        model, earlier_rows = self.order.merge(last.model, last.rows, done, pruned_count), last.rows
+        if pruned_count < done:
+            is_same = ~np.isin(last.rows, self.order.partners[pruned_count:done])
+            model, earlier_rows = model.select(np.flatnonzero(is_same)), last.rows[is_same]
+        return _with_values_of(model, earlier_rows, pruned, rows)
 
     def planned_steps(self, files: float) -> tuple[float, float]:
         """Return the numbers of steps of the refits of a search, and those through the quantisers of some files."""
