@@ -495,6 +495,12 @@ def with_c_numbers(text: str, registry: Registry) -> str:
         if enum["name"] != "error":
             prefix = f"SPEC_{enum['name'].upper()}"
             lines += [f"#define {prefix}_{e['name'].upper()} {c_value(e['id'])}" for e in enum["entries"]]
+            lines += [
+                f"#define {prefix}_{e['name'].upper()}_{key.upper()} {c_value(e[key])}"
+                for e in enum["entries"]
+                for key in e
+                if key.endswith("_bytes")
+            ]
     for structure in registry["structure"]:
         fields = fields_of(structure)
         prefix = f"SPEC_{structure['name'].upper()}"

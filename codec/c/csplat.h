@@ -80,6 +80,7 @@ typedef struct csplat_options {
     uint64_t splats_max;     /* limit of csplat_decode; default: none */
     uint64_t bytes_max;      /* limit of the arrays of csplat_decode and of codebooks; default: 8 GiB */
     uint64_t json_bytes_max; /* memory that a parsed text of csplat_read_text may take (STR-8); default: 128 MiB */
+    char resource_level_max; /* highest resource level (specification, 8.1) of a file, 'A', 'B' or 'C'; default: 'C', all */
     /* Replace malloc and free. Set both or neither. */
     void *(*allocate)(void *user, size_t size);
     void (*release)(void *user, void *memory);
@@ -105,6 +106,7 @@ typedef struct csplat_codebook {
 /* The contents of header and index. */
 typedef struct csplat_info {
     uint64_t file_size;
+    char resource_level;        /* what a decoder must be able to hold at least (specification, 8.1): 'A', 'B' or 'C' */
     uint64_t splat_count;       /* of level 0 */
     uint32_t tile_count;        /* of level 0: tiles 0 to tile_count - 1 */
     uint32_t coarse_tile_count; /* of higher levels; their numbers follow */

@@ -9,7 +9,7 @@ import struct
 from typing import Final, NamedTuple
 
 VERSION_MAJOR: Final = 0
-VERSION_MINOR: Final = 3
+VERSION_MINOR: Final = 4
 MEDIA_TYPE: Final = "model/vnd.csplat"
 EXTENSION: Final = ".csplat"
 MAGIC: Final = b"\x93\x43\x53\x50\x0d\x0a\x1a\x0a"
@@ -43,6 +43,16 @@ JSON_VALUE_COST: Final = 64  # memory that STR-8 counts for each comma, colon, a
 PROFILE_BASE: Final = 0
 PROFILE_ARCHIVE: Final = 1  # reserved
 PROFILE_NAMES: Final[dict[int, str]] = {0: "base"}
+
+# Resource levels
+RESOURCE_LEVEL_A: Final = 1
+RESOURCE_LEVEL_B: Final = 2
+RESOURCE_LEVEL_C: Final = 3
+RESOURCE_LEVEL_NAMES: Final[dict[int, str]] = {1: "A", 2: "B", 3: "C"}
+RESOURCE_LEVEL_INDEX_BYTES: Final[dict[int, int]] = {1: 1048576, 2: 16777216}
+RESOURCE_LEVEL_CODEBOOK_BYTES: Final[dict[int, int]] = {1: 16777216, 2: 268435456}
+RESOURCE_LEVEL_TILE_BYTES: Final[dict[int, int]] = {1: 33554432, 2: 67108864}
+RESOURCE_LEVEL_VERSION_BYTES: Final[dict[int, int]] = {1: 268435456, 2: 4294967296}
 
 # Chunk flags (bit masks)
 CHUNK_FLAG_CRITICAL: Final = 1
@@ -197,8 +207,8 @@ class Header(NamedTuple):
     version_major: int
     version_minor: int
     profile: int
+    resource_level: int
     reserved_0: int
-    reserved_1: int
     index_size: int
     file_size: int
     header_crc: int
@@ -206,7 +216,7 @@ class Header(NamedTuple):
 
 HEADER_STRUCT: Final = struct.Struct("<8sHHBBHIQI")
 HEADER_SIZE: Final = 32
-HEADER_OFFSETS: Final[dict[str, int]] = {"magic": 0, "version_major": 8, "version_minor": 10, "profile": 12, "reserved_0": 13, "reserved_1": 14, "index_size": 16, "file_size": 20, "header_crc": 28}
+HEADER_OFFSETS: Final[dict[str, int]] = {"magic": 0, "version_major": 8, "version_minor": 10, "profile": 12, "resource_level": 13, "reserved_0": 14, "index_size": 16, "file_size": 20, "header_crc": 28}
 
 
 def unpack_header(data: bytes | bytearray | memoryview, offset: int = 0) -> Header:
@@ -217,7 +227,7 @@ def unpack_header(data: bytes | bytearray | memoryview, offset: int = 0) -> Head
 
 def pack_header(r: Header) -> bytes:
     """Return the 32 bytes of a Header."""
-    return HEADER_STRUCT.pack(r.magic, r.version_major, r.version_minor, r.profile, r.reserved_0, r.reserved_1, r.index_size, r.file_size, r.header_crc)
+    return HEADER_STRUCT.pack(r.magic, r.version_major, r.version_minor, r.profile, r.resource_level, r.reserved_0, r.index_size, r.file_size, r.header_crc)
 
 
 class IndexHead(NamedTuple):

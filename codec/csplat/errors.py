@@ -101,8 +101,8 @@ class LimitError(CsplatError):
     def __init__(
         self,
         limit: str,
-        wanted: int,
-        allowed: int | None = None,
+        wanted: int | str,
+        allowed: int | str | None = None,
         code: str = "E_LIMIT",
         offset: int | None = None,
         clause: str = "",

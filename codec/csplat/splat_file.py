@@ -20,6 +20,7 @@ from csplat.decoder import (
     Node,
     read_header,
 )
+from csplat.decoder.budget import check_budget
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import (
@@ -29,9 +30,9 @@ from csplat.decoder.decode_api import (
     request_packed,
     request_tiles,
 )
-from csplat.decoder.limits import check_budget, float_bytes
 from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk, scene_metadata
 from csplat.decoder.reconstruct import boxes_touching, tile_boxes
+from csplat.decoder.resource_level import float_bytes
 from csplat.decoder.tiles import wanted_layers
 from csplat.decoder.tree import read_nodes, select_tiles
 from csplat.errors import InputError, counted
@@ -64,8 +65,8 @@ class SplatFile(Scene):
         self._open = True
         with self._store.named_errors():
             window = FileWindow(store, head)
-            self._head = _read_head(store, window)
-            self.header = header = read_header(window.view)
+            self._head = _read_head(store, window, limits)
+            self.header = header = read_header(window.view, limits=limits)
         self.count, self.sh_degree, self.origin = header.splat_count, header.sh_degree, header.origin
         self.extra = {column.name: np.dtype(column.dtype) for column in header.extras if column.dtype is not None}
         self.reader, self.has_doubles, self.file_axes = self.models, False, ""
@@ -390,11 +391,11 @@ def _levels_finding(header: SceneHeader, which: str) -> Finding:
     return Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")
 
 
-def _read_head(store: Store, window: FileWindow) -> bytes:
+def _read_head(store: Store, window: FileWindow, limits: Limits) -> bytes:
     """Return header and index, with any data after them from the same request."""
     first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
-    head = read_file_header(window.view)
+    head = read_file_header(window.view, limits.resource_level)
     check_length(window.view, head.file_size)
     end = _spec.HEADER_SIZE + head.index_size
     if end > first:

@@ -4,10 +4,11 @@
 import { CRC_SIZE, crc32 } from './checksums.mjs';
 import { fault } from './errors.mjs';
 import { checkReserved } from './payload.mjs';
+import { HIGHEST_LEVEL, nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 
 /**
- * @typedef {{version: string, profile: string, indexSize: number, fileSize: number, end: number}} FileHeader
+ * @typedef {{version: string, profile: string, resourceLevel: 'A' | 'B' | 'C', indexSize: number, fileSize: number, end: number}} FileHeader
  * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  */
 
@@ -36,9 +37,10 @@ function standIn(bytes) {
  * Read and check the header. Bytes after it are ignored.
  *
  * @param {Uint8Array<ArrayBuffer>} bytes
+ * @param {string} [levelMax] highest resource level to accept; default: all
  * @returns {FileHeader} `end` is the offset of the end of the index
  */
-export function readFileHeader(bytes) {
+export function readFileHeader(bytes, levelMax = HIGHEST_LEVEL) {
   const wrong = spec.MAGIC.findIndex((byte, i) => i < bytes.length && bytes[i] !== byte);
   if (wrong >= 0) {
     const clause = bytes.length < spec.HEADER_SIZE ? 'HDR-11' : 'HDR-1';
@@ -65,12 +67,25 @@ export function readFileHeader(bytes) {
   if (profile !== spec.PROFILE_BASE) {
     throw fault(spec.ERROR_UNSUPPORTED, AT.profile, 'HDR-4', `profile ${profile}: this decoder reads the profile base`);
   }
+  const resourceLevel = nameOf(spec.RESOURCE_LEVEL_NAMES, header.resource_level);
+  if (resourceLevel === undefined) {
+    throw fault(spec.ERROR_UNSUPPORTED, AT.resource_level, 'RES-2', `resource level ${header.resource_level}`);
+  }
+  if (resourceLevel > levelMax) {
+    throw fault(
+      spec.ERROR_LIMIT,
+      AT.resource_level,
+      'LIM-2',
+      `resource level ${resourceLevel}, the limit is ${levelMax}`,
+    );
+  }
   const fileSize = Number(header.file_size); // rounded above 2^53; no data is that long
   const end = spec.HEADER_SIZE + indexSize;
   if (indexSize < spec.INDEX_HEAD_SIZE + CRC_SIZE || end > fileSize) {
     throw fault(spec.ERROR_VALUE, AT.index_size, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
   }
-  return { version: `${major}.${minor}`, profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, end };
+  const profileName = spec.PROFILE_NAMES[spec.PROFILE_BASE];
+  return { version: `${major}.${minor}`, profile: profileName, resourceLevel, indexSize, fileSize, end };
 }
 
 /**

@@ -9,7 +9,12 @@ export interface Limits {
   bytes?: number;
   /** Memory of one JSON text, estimated from its bytes and values (STR-8). Default: 128 MiB. */
   jsonBytes?: number;
+  /** Highest resource level of a file (spec 8.1). Default: 'C', which is every file. */
+  resourceLevel?: ResourceLevel;
 }
+
+/** What a file requires a decoder to hold at least: 'A' suits phones, 'B' desktops, 'C' has no bounds. */
+export type ResourceLevel = 'A' | 'B' | 'C';
 
 /**
  * Inflates raw DEFLATE to exactly `size` bytes. Throws if the stream ends early or late, or if bytes follow it; the decoder
@@ -122,6 +127,7 @@ export interface TileRecord {
 export interface Header {
   version: string;
   profile: string;
+  resourceLevel: ResourceLevel;
   fileSize: number;
   indexSize: number;
   /** Splats of level 0, the scene. */

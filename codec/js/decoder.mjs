@@ -40,7 +40,8 @@ export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
  */
 export function readHeader(data, options = {}) {
   const bytes = toBytes(data);
-  const file = readFileHeader(bytes);
+  const limits = checkedLimits(options.limits);
+  const file = readFileHeader(bytes, limits.resourceLevel);
   if (bytes.length < file.end) {
     throw fault(
       spec.ERROR_TRUNCATED,
@@ -49,7 +50,7 @@ export function readHeader(data, options = {}) {
       `the index ends at ${file.end}, the data has ${bytes.length} bytes`,
     );
   }
-  return readIndex(bytes.subarray(spec.HEADER_SIZE, file.end), file, checkedLimits(options.limits));
+  return readIndex(bytes.subarray(spec.HEADER_SIZE, file.end), file, limits);
 }
 
 /**

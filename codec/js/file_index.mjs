@@ -7,6 +7,7 @@ import { checkIndexCrc, typeName } from './container.mjs';
 import { SINGLE_MIN, STEP_MIN } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import { nameOf, registeredFlags } from './registry.mjs';
+import { checkResourceLevel } from './resource_level.mjs';
 import * as spec from './spec.mjs';
 import { checkCoverage, checkTables, readTile } from './tile_records.mjs';
 
@@ -103,11 +104,14 @@ export function readIndex(bytes, file, limits) {
   }
   checkTree(header);
   checkCoverage(header, file.end);
+  checkResourceLevel(header, header.coarseTiles.length ? null : header.tiles);
   return header;
 }
 
 /** @param {FileHeader} file */
-const omit = ({ version, profile, fileSize, indexSize }) => ({ version, profile, fileSize, indexSize });
+const omit = ({ version, profile, resourceLevel, fileSize, indexSize }) => ({
+  ...{ version, profile, resourceLevel, fileSize, indexSize },
+});
 
 /**
  * Check IDX-8: the fields that this version reads lie within the record.

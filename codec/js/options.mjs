@@ -2,7 +2,7 @@
 // Checks of the caller's arguments. Every error here is E_INPUT.
 
 import { InputError } from './errors.mjs';
-import { LEVEL_MAX } from './registry.mjs';
+import { HIGHEST_LEVEL, LEVEL_MAX } from './registry.mjs';
 import { BUDGET_BYTES_JS, BUDGET_JSON_BYTES } from './spec.mjs';
 
 /**
@@ -44,12 +44,20 @@ function remedyFor(data) {
  * @returns {Required<Limits>}
  */
 export function checkedLimits(limits = {}) {
-  const complete = { splats: Infinity, bytes: BUDGET_BYTES_JS, jsonBytes: BUDGET_JSON_BYTES };
+  /** @type {Required<Limits>} */
+  const complete = {
+    splats: Infinity,
+    bytes: BUDGET_BYTES_JS,
+    jsonBytes: BUDGET_JSON_BYTES,
+    resourceLevel: HIGHEST_LEVEL,
+  };
   for (const [name, value] of Object.entries(limits)) {
     if (!Object.hasOwn(complete, name)) throw new InputError(`no limit is called ${name}`);
     if (value === undefined) continue;
-    if (typeof value !== 'number' || !(value >= 0)) throw new InputError(`limits.${name} is ${value}`);
-    complete[/** @type {keyof Limits} */ (name)] = value;
+    const isLevel = name === 'resourceLevel';
+    const isValid = isLevel ? ['A', 'B', 'C'].includes(String(value)) : typeof value === 'number' && value >= 0;
+    if (!isValid) throw new InputError(`limits.${name} is ${value}, expected ${isLevel ? 'A, B or C' : '0 or more'}`);
+    Object.assign(complete, { [name]: value });
   }
   return complete;
 }

@@ -101,7 +101,7 @@ export class Reader {
       source = await openSource(from, way);
       const known = source.size ?? Infinity;
       const head = await source.read(0, Math.min(spec.HEADER_SIZE, known), signal);
-      const file = readFileHeader(head);
+      const file = readFileHeader(head, limits.resourceLevel);
       if (known !== Infinity) checkFileSize(known, file);
       progress.fileSize = file.fileSize;
       opening.set(0, head);

@@ -6,12 +6,16 @@ import * as spec from './spec.mjs';
 /** Highest level of detail: the largest u8. */
 export const LEVEL_MAX = 255;
 
+/** Name of the highest resource level. */
+export const HIGHEST_LEVEL = spec.RESOURCE_LEVEL_NAMES[spec.RESOURCE_LEVEL_C];
+
 /**
  * Return the name of a registry entry.
  *
- * @param {Record<number, string>} names
+ * @template {string} T
+ * @param {Record<number, T>} names
  * @param {number} id
- * @returns {string | undefined} undefined for reserved and unlisted ids
+ * @returns {T | undefined} undefined for reserved and unlisted ids
  */
 export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : undefined);
 

@@ -3,6 +3,7 @@
 
 import { LimitError, fault } from './errors.mjs';
 import { checkedSelection } from './options.mjs';
+import { checkResourceLevel } from './resource_level.mjs';
 import * as spec from './spec.mjs';
 import { allTiles } from './tile_records.mjs';
 
@@ -17,7 +18,7 @@ const { ERROR_INDEX, ERROR_LIMIT, ERROR_STREAM, ERROR_VALUE, NODE_RECORD_OFFSETS
  */
 
 /**
- * Read and check the payload of TREE.
+ * Read and check the payload of TREE, and with it the resource level.
  *
  * @param {Payload | null} payload null: the file has no TREE
  * @param {Header} header
@@ -38,6 +39,11 @@ export function readNodes(payload, header) {
     checkNode(node, nodes, recordOf(node));
     for (const child of node.children) extendBox(node, nodes[child]); // whose box is complete: it comes first
   }
+  const roots = nodes.filter(({ parent }) => parent === null);
+  checkResourceLevel(
+    header,
+    roots.flatMap(({ firstTile, tileCount }) => tiles.slice(firstTile, firstTile + tileCount)),
+  );
   return nodes;
 }
 

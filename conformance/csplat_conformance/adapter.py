@@ -171,6 +171,7 @@ def _manifest_header(header: Any) -> dict[str, Any]:
     flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
     return {
         "profile": header.profile,
+        "resource_level": header.resource_level,
         "splat_count": header.splat_count,
         "tile_count": len(header.all_tiles),
         "sh_degree": header.sh_degree,

@@ -89,7 +89,7 @@ def test_our_renderer_is_within_the_tolerance():
 ])  # fmt: skip
 def test_a_faulty_renderer_is_below_the_required_psnr(name, change):
     recipe = next(recipe for recipe in rendered_recipes() if recipe.name == name)
-    made = expected(recipe.scene)
+    made = expected(recipe.scene, 0)
     floats = made.floats | (change(made.floats) if change else {})
     antialiased = bool(made.header["scene_flags"]) and change is not None
 

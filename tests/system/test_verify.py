@@ -38,7 +38,7 @@ def test_verify_finds_damage(csplat_file):
 
 def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     data = bytearray(csplat_file.read_bytes())
-    data[13] = 1  # a reserved field of the header
+    data[14] = 1  # a reserved field of the header
     at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["scene_flags"]
     data[at] |= 0x08  # and a reserved flag of the scene
     csplat_file.write_bytes(data)

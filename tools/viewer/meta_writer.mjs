@@ -4,6 +4,7 @@
 import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
 import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { registeredFlags } from '../../codec/js/registry.mjs';
+import { requiredLevel } from '../../codec/js/resource_level.mjs';
 import * as spec from '../../codec/js/spec.mjs';
 import { allTiles } from '../../codec/js/tile_records.mjs';
 
@@ -69,6 +70,10 @@ export async function withUp(bytes, up) {
   const axesAt = spec.HEADER_SIZE + AT_INDEX.axes;
   if (!isUpright(header.axes, up)) index.fill(spec.DIRECTION_UNSPECIFIED, axesAt, axesAt + 3);
   view.setUint16(spec.HEADER_SIZE + AT_INDEX.directory_count, count, true);
+  const tiles = allTiles(header);
+  const roots = (await reader.nodes()).filter(({ parent }) => parent === null);
+  const coarsest = roots.flatMap(({ firstTile, tileCount }) => tiles.slice(firstTile, firstTile + tileCount));
+  view.setUint8(AT_HEADER.resource_level, requiredLevel({ ...header, indexSize }, coarsest).id);
   view.setUint32(AT_HEADER.index_size, indexSize, true);
   view.setBigUint64(AT_HEADER.file_size, BigInt(at), true);
   view.setUint32(AT_HEADER.header_crc, crc32(index.subarray(0, HEADER_FIXED)), true);

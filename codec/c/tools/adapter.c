@@ -93,7 +93,8 @@ static uint32_t tiles_of(const csplat_info *info)
 static void put_header(const csplat_info *info)
 {
     FILE *file = create("header", "");
-    fprintf(file, "{\"profile\": \"base\", \"splat_count\": %llu, \"tile_count\": %lu, \"sh_degree\": %u, ",
+    fprintf(file, "{\"profile\": \"base\", \"resource_level\": \"%c\", ", info->resource_level);
+    fprintf(file, "\"splat_count\": %llu, \"tile_count\": %lu, \"sh_degree\": %u, ",
             (unsigned long long)info->splat_count, (unsigned long)tiles_of(info), info->sh_degree);
     fprintf(file, "\"scene_flags\": [%s%s%s], ", info->antialiased ? "\"antialiased\"" : "",
             info->antialiased && info->flat ? ", " : "", info->flat ? "\"flat\"" : "");

@@ -156,10 +156,13 @@ static void budgets_hold(const unsigned char *data, size_t size)
     int found;
     HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL) && !csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene));
     options.splats_max = scene->splat_count - 1;
+    options.resource_level_max = (char)(csplat_get_info(d)->resource_level - 1);
     csplat_free_scene(d, scene);
     HOLDS(!csplat_check(d) && !csplat_read_text(d, CSPLAT_METADATA, &text, &length) && text && text[length] == '\0');
     HOLDS(!csplat_read_declared_errors(d, &errors, &found));
     csplat_close(d);
+    HOLDS(csplat_open_memory(&d, data, size, &options, NULL) == CSPLAT_E_LIMIT && !d);
+    options.resource_level_max++;
     HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_E_LIMIT && !scene);
     csplat_close(d);
     options.splats_max = 0;

@@ -16,9 +16,9 @@ The package was written from `spec/format.md` alone. It shares only the registry
 | `read_metadata` | the metadata of the scene |
 | `read_options`, `read_declared_bounds` | one chunk |
 
-Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `index`, `entropy`
-(streams), `blocks` (integers of an attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `packed`,
-`tree`, `limits`, `metadata`, `decode_api`.
+Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `limits`,
+`resource_level`, `index`, `entropy` (streams), `blocks` (integers of an attribute), `reconstruct` (integers to values),
+`codebooks`, `tiles`, `packed`, `tree`, `budget`, `metadata`, `decode_api`.
 """
 
 from csplat.decoder.container import ExtraColumn, SceneHeader, Tile

@@ -17,11 +17,14 @@ from typing import Any, NoReturn
 import numpy as np
 
 from csplat import _spec
-from csplat.errors import FormatError, InputError, UnsupportedError
+from csplat.errors import FormatError, InputError, LimitError, UnsupportedError
 from csplat.file_source import File, describe_substitute, map_file
 
 #: Flags of a TILE chunk.
 TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
+
+#: Name of the highest resource level.
+HIGHEST_LEVEL = _spec.RESOURCE_LEVEL_NAMES[max(_spec.RESOURCE_LEVEL_NAMES)]
 
 _CRC_SIZE = 4  # bytes
 _SUBSTITUTE_SIZE = 64  # bytes that `describe_substitute` needs
@@ -88,6 +91,7 @@ class SceneHeader:
     Attributes:
         version: (major, minor).
         profile: name of the profile, `base`.
+        resource_level: what the file requires a decoder to hold at least (spec 8.1): `A`, `B` or `C`.
         file_size: size of the file, bytes.
         index_size: size of the index, bytes.
         splat_count: N, the splats of level 0.
@@ -103,6 +107,7 @@ class SceneHeader:
 
     version: tuple[int, int]
     profile: str
+    resource_level: str
     file_size: int
     index_size: int
     splat_count: int
@@ -213,8 +218,13 @@ def refuse_field(
     raise FormatError(code, at + offsets[name], clause, name, found=getattr(record, name), wanted=wanted)
 
 
-def read_file_header(view: memoryview) -> _spec.Header:
-    """Read and check the header (HDR-1 to HDR-4, HDR-7, HDR-11)."""
+def read_file_header(view: memoryview, level_max: str = HIGHEST_LEVEL) -> _spec.Header:
+    """Read and check the header (HDR-1 to HDR-4, HDR-7, HDR-11, LIM-2).
+
+    Args:
+        view: a file or its beginning.
+        level_max: name of the highest resource level that is accepted.
+    """
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
@@ -238,6 +248,11 @@ def read_file_header(view: memoryview) -> _spec.Header:
     _check_crc(view[:crc_at], header.header_crc, crc_at, "HDR-3")
     if header.profile not in _spec.PROFILE_NAMES:
         raise UnsupportedError(f"profile {header.profile}", offset=offsets["profile"], clause="HDR-4")
+    level, level_at = _spec.RESOURCE_LEVEL_NAMES.get(header.resource_level), offsets["resource_level"]
+    if level is None:
+        raise UnsupportedError(f"resource level {header.resource_level}", offset=level_at, clause="RES-2")
+    if level > level_max:
+        raise LimitError("resource_level", level, level_max, offset=level_at, clause="LIM-2")
     check_reserved(header, 0, offsets)
     least, most = _spec.INDEX_HEAD_SIZE + _CRC_SIZE, header.file_size - _spec.HEADER_SIZE
     if not least <= header.index_size <= most:

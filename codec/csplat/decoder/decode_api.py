@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.decoder.budget import check_budget, integer_bytes
 from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
 from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk, view_of
 from csplat.decoder.index import parse_header
-from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
+from csplat.decoder.limits import Limits
 from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk, scene_metadata
 from csplat.decoder.packed import pack_tables, pack_tile
 from csplat.decoder.reconstruct import (
@@ -28,6 +29,7 @@ from csplat.decoder.reconstruct import (
     write_integers,
     write_tile,
 )
+from csplat.decoder.resource_level import float_bytes
 from csplat.decoder.tiles import read_tile
 from csplat.decoder.tree import read_nodes
 from csplat.errors import InputError, LimitError, counted
@@ -348,7 +350,8 @@ def _request_of(
 ) -> DecodeRequest:
     """Parse the header of a whole file, and check what is to be decoded (`prepare_decode`)."""
     view = view_of(data)
-    return prepare_decode(view, parse_header(view, whole=True), limits, tiles, sh_degree, every_level=every_level)
+    header = parse_header(view, whole=True, limits=limits)
+    return prepare_decode(view, header, limits, tiles, sh_degree, every_level=every_level)
 
 
 def _check_tile_budget(request: DecodeRequest) -> None:

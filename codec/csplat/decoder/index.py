@@ -22,6 +22,8 @@ from csplat.decoder.container import (
     refuse_length,
     view_of,
 )
+from csplat.decoder.limits import Limits
+from csplat.decoder.resource_level import check_resource_level
 from csplat.errors import FormatError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -53,28 +55,31 @@ _SINGLE_CHUNKS = (
 )  # fmt: skip
 
 
-def read_header(data: File) -> SceneHeader:
+def read_header(data: File, *, limits: Limits | None = None) -> SceneHeader:
     """Read the header and index of a file, and check their CRCs; chunks are not read.
 
     Args:
         data: a file, as in `decode`, or its beginning: the first HEADER_SIZE + index_size bytes suffice.
+        limits: of which only the resource level is used.
 
     Raises:
         FormatError: header or index breaks a clause; E_TRUNCATED if the data ends before the index does.
         UnsupportedError: another version or profile, or a critical chunk of unknown type.
+        LimitError: the resource level is above that of `limits`.
         InputError: `data` is not a file or contiguous bytes.
     """
-    return parse_header(view_of(data), whole=False)
+    return parse_header(view_of(data), whole=False, limits=limits)
 
 
-def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
+def parse_header(view: memoryview, *, whole: bool, limits: Limits | None = None) -> SceneHeader:
     """Read header and index; errors as in `read_header`.
 
     Args:
         view: a file or its beginning.
         whole: require data of exactly the file's size (HDR-5, HDR-6).
+        limits: as in `read_header`.
     """
-    file = read_file_header(view)
+    file = read_file_header(view, (limits or Limits()).resource_level)
     if whole:
         check_length(view, file.file_size)
     start, end = _spec.HEADER_SIZE, _spec.HEADER_SIZE + file.index_size
@@ -99,9 +104,10 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     _check_levels(tiles, directory, directory_at)
     check_coverage(directory, directory_at, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
-    return SceneHeader(
+    header = SceneHeader(
         version=(file.version_major, file.version_minor),
         profile=_spec.PROFILE_NAMES[file.profile],
+        resource_level=_spec.RESOURCE_LEVEL_NAMES[file.resource_level],
         file_size=file.file_size,
         index_size=file.index_size,
         splat_count=head.splat_count,
@@ -118,6 +124,8 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
         tiles=tiles[: sum(tile.level == 0 for tile in tiles)],
         coarse_tiles=tiles[sum(tile.level == 0 for tile in tiles) :],
     )
+    check_resource_level(header, None if header.coarse_tiles else header.tiles)
+    return header
 
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:

@@ -75,7 +75,7 @@ class DeclaredBounds:
 def read_metadata(data: File, *, limits: Limits | None = None) -> SceneMetadata:
     """Return the metadata of a scene: flags, axes and unit of the index, and the contents of META and CAMS."""
     view = view_of(data)
-    return scene_metadata(view, parse_header(view, whole=True), limits or Limits())
+    return scene_metadata(view, parse_header(view, whole=True, limits=limits), limits or Limits())
 
 
 def scene_metadata(view: memoryview, header: SceneHeader, limits: Limits) -> SceneMetadata:
@@ -190,7 +190,7 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
 def _read_text(data: File, kind: bytes, limits: Limits | None) -> Any:
     """Return the parsed JSON of the file's chunk of type `kind`; as in `json_chunk`."""
     view = view_of(data)
-    return json_chunk(view, parse_header(view, whole=True), kind, (limits or Limits()).json_bytes)
+    return json_chunk(view, parse_header(view, whole=True, limits=limits), kind, (limits or Limits()).json_bytes)
 
 
 class _RefusedError(ValueError):

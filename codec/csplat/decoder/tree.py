@@ -13,6 +13,7 @@ import numpy as np
 from csplat import _spec
 from csplat.decoder.container import SceneHeader, Tile, open_chunk
 from csplat.decoder.reconstruct import boxes_touching, tile_boxes
+from csplat.decoder.resource_level import check_resource_level
 from csplat.errors import FormatError, InputError, LimitError
 from csplat.types import F64
 
@@ -39,7 +40,7 @@ class Node:
 
 
 def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
-    """Read and check the TREE chunk (TRE-2 to TRE-8).
+    """Read and check the TREE chunk (TRE-2 to TRE-8), and the resource level (RSL-1, RSL-2).
 
     Args:
         view: the file, or a part that contains the chunk.
@@ -74,6 +75,7 @@ def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
     )
     for at, node in zip(offsets, nodes, strict=True):
         _check_node(nodes, node, at)
+    check_resource_level(header, [tile for node in nodes if node.parent is None for tile in node.tiles])
     return nodes
 
 

@@ -186,7 +186,7 @@ def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes
         offset += where[0]
     index = _index(scene, tiles, directory, layers)
     assert len(index) == index_size
-    yield _header(len(index), offset)
+    yield _header(_resource_level(scene, tiles, len(index)), len(index), offset)
     yield index
     for _, chunk in _ordered_chunks(scene, tiles):
         yield _chunk_head(chunk.type, len(chunk.payload))
@@ -315,15 +315,61 @@ def _index(
     return index + zlib.crc32(index).to_bytes(_CRC_SIZE, "little")
 
 
-def _header(index_size: int, file_size: int) -> bytes:
+def _resource_level(scene: SceneFields, tiles: Sequence[FileTile], index_size: int) -> int:
+    """Return the lowest resource level whose bounds the contents obey (spec 8.1); `index_size` is in bytes."""
+    splat_bytes = 4 * (3 + 4 + 3 + 1 + 3 * (scene.sh_degree + 1) ** 2)
+    extra_bytes = sum(_spec.EXTRA_DTYPE_BYTES.get(extra.dtype, 0) for extra in scene.extras)
+    sizes = [tile.splat_count * (splat_bytes + extra_bytes * (tile.level == 0)) for tile in tiles]
+    coarsest = _coarsest_tiles(scene, tiles)
+    version = sum(tile.splat_count for tile in coarsest) * splat_bytes
+    if not any(tile.level for tile in coarsest):
+        version += sum(tile.splat_count for tile in coarsest) * extra_bytes
+    columns = {
+        _spec.CODEBOOK_KIND_SHAPE: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SCALES]
+        + _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_QUATS]
+    }
+    elements = 0
+    for book in scene.codebooks:
+        bands = range(book.bands[0], book.bands[1] + 1)
+        elements += book.size * columns.get(book.kind, sum(3 * (2 * band + 1) for band in bands))
+    needed = (
+        (index_size, _spec.RESOURCE_LEVEL_INDEX_BYTES),
+        (4 * elements, _spec.RESOURCE_LEVEL_CODEBOOK_BYTES),
+        (max(sizes, default=0), _spec.RESOURCE_LEVEL_TILE_BYTES),
+        (version, _spec.RESOURCE_LEVEL_VERSION_BYTES),
+    )
+    return next(
+        level
+        for level in sorted(_spec.RESOURCE_LEVEL_NAMES)
+        if all(size <= bounds.get(level, math.inf) for size, bounds in needed)
+    )
+
+
+def _coarsest_tiles(scene: SceneFields, tiles: Sequence[FileTile]) -> Sequence[FileTile]:
+    """Return the tiles of the nodes without a parent; all tiles if there are no nodes."""
+    tree = next((chunk.payload for chunk in scene.chunks if chunk.type == _spec.CHUNK_TREE), None)
+    if tree is None:
+        return tiles
+    assert isinstance(tree, bytes)
+    coarsest: list[FileTile] = []
+    first = 0
+    for at in range(0, len(tree), _spec.NODE_RECORD_SIZE):
+        node = _spec.unpack_node_record(tree, at)
+        if node.parent == _spec.NO_PARENT:
+            coarsest += tiles[first : first + node.tile_count]
+        first += node.tile_count
+    return coarsest
+
+
+def _header(resource_level: int, index_size: int, file_size: int) -> bytes:
     """Return the header, including its CRC (spec 4.2); sizes are in bytes."""
     header = _spec.Header(
         magic=_spec.MAGIC,
         version_major=_spec.VERSION_MAJOR,
         version_minor=_spec.VERSION_MINOR,
         profile=_spec.PROFILE_BASE,
+        resource_level=resource_level,
         reserved_0=0,
-        reserved_1=0,
         index_size=index_size,
         file_size=file_size,
         header_crc=0,

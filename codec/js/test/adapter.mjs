@@ -56,6 +56,7 @@ async function decoded(bytes, limits = {}) {
   const { header } = scene;
   const facts = {
     profile: header.profile,
+    resource_level: header.resourceLevel,
     splat_count: header.splatCount,
     tile_count: header.tiles.length + header.coarseTiles.length,
     sh_degree: header.shDegree,

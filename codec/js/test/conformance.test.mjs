@@ -21,6 +21,7 @@ const hashes = (scene, expected) =>
 const wanted = (expected) => Object.fromEntries(Object.entries(expected).map(([name, [, , sha]]) => [name, sha]));
 const facts = (header) => ({
   profile: header.profile,
+  resource_level: header.resourceLevel,
   splat_count: header.splatCount,
   tile_count: allTiles(header).length,
   sh_degree: header.shDegree,

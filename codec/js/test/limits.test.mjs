@@ -88,6 +88,17 @@ test('the bytes of a long answer are complete, and a short one takes no memory o
   assert.ok(process.memoryUsage().arrayBuffers < before + 30e6);
 });
 
+test('a file of a higher resource level is refused from its header', async () => {
+  const file = vector('extreme/resource_level_b');
+  assert.equal(readHeader(file, { limits: { resourceLevel: 'B' } }).resourceLevel, 'B');
+  const limits = { resourceLevel: 'A' };
+  for (const run of [() => readHeader(file.slice(0, 32), { limits }), () => CsplatReader.open(file, { limits })]) {
+    const error = await refusal(run);
+    assert.deepEqual([error.code, error.clause, error.offset], ['E_LIMIT', 'LIM-2', 13]);
+  }
+  assert.equal((await refusal(() => decode(file, { limits: { resourceLevel: 'D' } }))).code, 'E_INPUT');
+});
+
 for (const name of ['extreme/seeded', 'valid/sh_degree_4_mixed']) {
   test(`${name}: a lower SH degree gives the rows of the lower bands`, async () => {
     const file = vector(name);
@@ -107,13 +118,13 @@ for (const name of ['extreme/seeded', 'valid/sh_degree_4_mixed']) {
 }
 
 test('files of other versions are refused by name', async () => {
-  assert.equal(readHeader(rich).version, '0.3');
+  assert.equal(readHeader(rich).version, '0.4');
   for (const [name, version] of [
-    ['below', '0.2'],
-    ['above', '0.4'],
+    ['below', '0.3'],
+    ['above', '0.5'],
   ]) {
     const error = await refusal(() => readHeader(vector(`invalid/header_version_minor_${name}`)));
-    assert.ok(error.message.endsWith(`has version ${version}, this decoder reads 0.3`));
+    assert.ok(error.message.endsWith(`has version ${version}, this decoder reads 0.4`));
   }
 });
 

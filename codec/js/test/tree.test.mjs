@@ -65,7 +65,11 @@ function forest(counts, seed) {
     view.setUint32(NODE_RECORD_SIZE * n + NODE_RECORD_OFFSETS.tile_count, 1, true);
     view.setFloat32(NODE_RECORD_SIZE * n + NODE_RECORD_OFFSETS.error, error, true);
   }
-  const header = { tiles: tiles.slice(0, counts[0]), coarseTiles: tiles.slice(counts[0]) };
+  const header = {
+    ...{ resourceLevel: 'A', indexSize: 0, shDegree: 0, extras: [], directory: [], codebooks: [] },
+    tiles: tiles.slice(0, counts[0]),
+    coarseTiles: tiles.slice(counts[0]),
+  };
   return { nodes: readNodes(new Payload(bytes, 0, 'TRE-2'), header), header };
 }
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 from csplat import _spec
 from csplat_conformance.validator.index import Chunk, Tile
@@ -54,8 +55,11 @@ def find_tree(log: ViolationLog, directory: Sequence[Chunk], tiles: Sequence[Til
     return chunk
 
 
-def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
+def check_tree(payload: Payload, tiles: Sequence[Tile]) -> list[Tile] | None:
     """Check the payload of TREE: TRE-2 to TRE-8. Clauses about tiles that a node may not have are not checked.
+
+    Returns:
+        The tiles of all roots, `None` if they are not known.
 
     Raises:
         UnreadableError: the payload does not consist of whole records.
@@ -75,6 +79,13 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
     _find_children(log, nodes, record_count)
     for node in nodes:
         _check_node(log, node)
+    if any(node.splat_count is None for node in nodes):
+        return None
+    ends = list(accumulate(node.record.record.tile_count for node in nodes))
+    return [
+        tile for node, end in zip(nodes, ends, strict=True) if node.record.record.parent == _spec.NO_PARENT
+        for tile in tiles[end - node.record.record.tile_count : end]
+    ]  # fmt: skip
 
 
 def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Tile], start: tuple[int, str]) -> None:

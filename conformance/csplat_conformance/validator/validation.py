@@ -23,6 +23,7 @@ from csplat_conformance.validator.index import (
     read_records,
     read_tiles,
 )
+from csplat_conformance.validator.resource_level import check_resource_level
 from csplat_conformance.validator.tiles import CodebookEntries, TileChecker, read_codebook
 from csplat_conformance.validator.tree import check_tree, find_tree
 from csplat_conformance.validator.violation_log import (
@@ -133,7 +134,11 @@ def _check(
     else:
         log.skip("the chunks", "the index does not list all of them")
         return
-    books = _read_directory_chunks(view, directory, tiles, index, json_bytes_max, log)
+    coarsest: list[list[Tile]] = []
+    books = _read_directory_chunks(view, directory, tiles, index, json_bytes_max, coarsest, log)
+    if not any(tile.level for tile in tiles):
+        coarsest.append(tiles)
+    check_resource_level(log, header, index, tiles, coarsest[0] if coarsest else None)
     if splats_max is not None and sum(tile.count for tile in tiles if tile.level == 0) > splats_max:
         log.add_field("LIM-1", index.head, "splat_count", f"{counts.splats}, expected at most {splats_max} (budget)")
         log.skip("the tiles", "the number of splats exceeds the budget")
@@ -170,6 +175,8 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     log.checks.append("header_crc")
     if record.profile not in _spec.PROFILE_NAMES:
         log.add_field("HDR-4", header, "profile", f"{record.profile} is not a profile of this version")
+    if record.resource_level not in _spec.RESOURCE_LEVEL_NAMES:
+        log.add_field("RES-2", header, "resource_level", f"{record.resource_level} is not a level of this version")
     log.check_reserved(header)
     return header
 
@@ -204,9 +211,18 @@ def _find_index_end(view: memoryview, header: Header, log: ViolationLog) -> int 
 
 
 def _read_directory_chunks(
-    view: memoryview, directory: list[Chunk], tiles: list[Tile], index: Index, json_bytes_max: int, log: ViolationLog
+    view: memoryview,
+    directory: list[Chunk],
+    tiles: list[Tile],
+    index: Index,
+    json_bytes_max: int,
+    coarsest: list[list[Tile]],
+    log: ViolationLog,
 ) -> CodebookEntries:
-    """Check every whole chunk of the directory, used or not, known or not (CHK-2); return the entries of codebooks."""
+    """Check every whole chunk of the directory, used or not, known or not (CHK-2); return the entries of codebooks.
+
+    Adds the tiles of the coarsest version to `coarsest`, if TREE specifies them.
+    """
     books: CodebookEntries = {}
     tree = find_tree(log, directory, tiles)
     for chunk in directory:
@@ -220,10 +236,16 @@ def _read_directory_chunks(
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
             _read_payload(payload, log, partial(read_codebook, payload, chunk, index, books))
         elif chunk is tree:
-            _read_payload(payload, log, partial(check_tree, payload, tiles))
+            _read_payload(payload, log, partial(_read_tree, payload, tiles, coarsest))
         elif chunk.kind == _spec.CHUNK_TREE:
             log.skip(payload.name, "the file must not contain it")
     return books
+
+
+def _read_tree(payload: Payload, tiles: list[Tile], coarsest: list[list[Tile]]) -> None:
+    roots = check_tree(payload, tiles)
+    if roots is not None:
+        coarsest.append(roots)
 
 
 def _read_tile_chunks(

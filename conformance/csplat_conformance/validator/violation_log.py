@@ -384,4 +384,6 @@ CODES: Final[dict[str, str]] = {
     "QUA-1": _spec.ERROR_RANGE,
     "QUA-2": _spec.ERROR_RANGE,
     "LIM-1": _spec.ERROR_LIMIT,
+    "RSL-1": _spec.ERROR_VALUE,
+    "RSL-2": _spec.ERROR_VALUE,
 }

@@ -93,7 +93,7 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
     expect: dict[str, Any] = {}
     error: dict[str, Any] = {}
     if recipe.scene is not None:
-        result = expected(recipe.scene)
+        result = expected(recipe.scene, _spec.unpack_header(data).index_size)
         expect = {"header": result.header}
         for key in ("integers", "floats", "extra"):
             expect[key] = summarise(getattr(result, key))
@@ -131,7 +131,7 @@ def _pictures(recipe: Recipe, renders: bool) -> dict[Path, bytes]:
         path = VECTORS / picture_name(recipe.name, number)
         old = path.read_bytes() if path.exists() else b""
         if (renders or not old) and recipe.scene is not None:
-            made = expected(recipe.scene)
+            made = expected(recipe.scene, 0)
             flags = made.header["scene_flags"]
             picture = reference_render(made.floats, view.camera, "antialiased" in flags)
             if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:

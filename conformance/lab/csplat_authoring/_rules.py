@@ -49,7 +49,7 @@ class Mask(NamedTuple):
 
 RANGES: Final[tuple[Range, ...]] = (
     Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
-    Range("header", "version_minor", "", 3, 3, "HDR-2", "E_VERSION"),
+    Range("header", "version_minor", "", 4, 4, "HDR-2", "E_VERSION"),
     Range("index_head", "head_size", "", 64, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "attribute_size", "", 16, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "codebook_size", "", 12, 255, "IDX-8", "E_VALUE"),
@@ -97,6 +97,7 @@ RANGES: Final[tuple[Range, ...]] = (
 
 CHOICES: Final[tuple[Choice, ...]] = (
     Choice("header", "profile", "", (0,), (1, 2), "HDR-4", "E_UNSUPPORTED"),
+    Choice("header", "resource_level", "", (1, 2, 3), (0, 4), "RES-2", "E_UNSUPPORTED"),
     Choice("index_head", "axes", "", (0, 1, 2, 3, 4, 5, 6), (7,), "IDX-4", "E_VALUE"),
     Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
     Choice("codebook_record", "kind", "", (4, 6), (3, 5), "RES-2", "E_UNSUPPORTED"),
@@ -109,8 +110,7 @@ CHOICES: Final[tuple[Choice, ...]] = (
 )
 
 MASKS: Final[tuple[Mask, ...]] = (
-    Mask("header", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
-    Mask("header", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),
+    Mask("header", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
     Mask("index_head", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("index_head", "scene_flags", "", 243, 8, "RES-1", "E_RESERVED"),
     Mask("attribute_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),

@@ -73,8 +73,9 @@ _SECTIONS: Final = {
 }
 
 _NOTES: Final = {
-    "header.version_minor": "version 0.3",
+    "header.version_minor": "version 0.4",
     "header.profile": "BASE",
+    "header.resource_level": "A",
     "header.index_size": "so the chunks begin at 32 + 276 = 308",
     "header.header_crc": "of the bytes 0 to 27",
     "index.splat_count": "N",
@@ -173,6 +174,7 @@ def _value(entry: Field, raw: bytes) -> str:
 #: Clauses that no vector covers, with the reason or the tests that cover them instead.
 UNCOVERED: Final = {
     "CHK-5": "applies to editors",
+    "LIM-2": "applies to a decoder's interface: `test_resource_level.py`",
     "CHK-7": "the vectors that are marked optional, for decoders that read the payload",
     "SER-5": "checking declared errors requires the source: `test_bounds_verification.py`, `test_validation.py`",
     "SER-6": "applies to encoders: `test_bounds_verification.py`",

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from csplat import _spec
 from csplat_authoring import coders
-from csplat_authoring.reference import max_scale
+from csplat_authoring.reference import max_scale, required_level
 from csplat_authoring.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
 from csplat_conformance.fields import Field, Writer
 
@@ -85,7 +85,8 @@ def build(scene: Scene) -> Built:
         at += len(chunks[name].data)
 
     file = Writer()
-    file.structure("header", "header", _header(index_size, at))
+    level = required_level(scene, index_size) if scene.resource_level is None else scene.resource_level
+    file.structure("header", "header", _header(level, index_size, at))
     index = _index(scene, chunks, offsets)
     file.append(index)
     file.value("index.crc", "I", 0)
@@ -98,8 +99,9 @@ def build(scene: Scene) -> Built:
     return replace(unsealed, data=unsealed.patched({}))
 
 
-def _header(index_size: int, file_size: int) -> list[Any]:
-    return [_spec.MAGIC, _spec.VERSION_MAJOR, _spec.VERSION_MINOR, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
+def _header(level: int, index_size: int, file_size: int) -> list[Any]:
+    version = [_spec.VERSION_MAJOR, _spec.VERSION_MINOR]
+    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, level, 0, index_size, file_size, 0]
 
 
 # Index ---------------------------------------------------------------------------------------------

@@ -41,9 +41,9 @@ class Expected:
     cuts: list[tuple[str, list[int] | str]] = field(default_factory=list)
 
 
-def expected(scene: Scene) -> Expected:
-    """Compute the expected result in the manifest for a valid file."""
-    result = Expected(_header(scene))
+def expected(scene: Scene, index_size: int) -> Expected:
+    """Compute the expected result in the manifest for a valid file, whose index has `index_size` bytes."""
+    result = Expected(_header(scene, index_size))
     rows = {attribute: _all_rows(scene, attribute) for attribute in scene.attributes}
     result.integers = _integers(scene, rows)
     if scene.nodes or len(scene.tiles) > 1:
@@ -56,15 +56,15 @@ def expected(scene: Scene) -> Expected:
         if extra.dtype not in EXTRA_DTYPES:
             continue  # ANC-3
         bits = [row[0] for tile in scene.tiles for row in tile.extras[i].rows]
-        size = _spec.EXTRA_DTYPE_BYTES[extra.dtype]
-        raw = b"".join(value.to_bytes(size, "little") for value in bits)
-        result.extra[extra.name] = np.frombuffer(raw, EXTRA_DTYPES[extra.dtype])
+        unsigned = np.array(bits, f"<u{_spec.EXTRA_DTYPE_BYTES[extra.dtype]}")
+        result.extra[extra.name] = unsigned.view(EXTRA_DTYPES[extra.dtype])
     return result
 
 
-def _header(scene: Scene) -> dict[str, Any]:
+def _header(scene: Scene, index_size: int) -> dict[str, Any]:
     return {
         "profile": _spec.PROFILE_NAMES[_spec.PROFILE_BASE],
+        "resource_level": _spec.RESOURCE_LEVEL_NAMES[required_level(scene, index_size)],
         "splat_count": sum(tile.splat_count for tile in scene.finest.tiles),
         "tile_count": len(scene.tiles),
         "sh_degree": scene.sh_degree,
@@ -73,6 +73,30 @@ def _header(scene: Scene) -> dict[str, Any]:
         "unit_metres": scene.unit_metres or 0.0,  # 0 of either sign is 0
         "origin": list(scene.origin),
     }
+
+
+def required_level(scene: Scene, index_size: int) -> int:
+    """Return the lowest resource level that the contents allow (8.1); `index_size` is in bytes."""
+    extra_bytes = sum(_spec.EXTRA_DTYPE_BYTES.get(extra.dtype, 0) for extra in scene.extras)
+    splat_bytes = 4 * (11 + 3 * (scene.sh_degree + 1) ** 2)
+    coarsest: list[Tile] = [] if scene.nodes else list(scene.tiles)
+    left = list(scene.tiles)
+    for node in scene.nodes:
+        if node.parent == _spec.NO_PARENT:
+            coarsest += left[: node.tile_count]
+        left = left[node.tile_count :]
+    with_extras = all(tile.level == 0 for tile in coarsest)
+    sizes = {
+        "index": index_size,
+        "codebook": sum(4 * len(rows) * len(rows[0]) for book in scene.codebooks for rows in book.entries.values()),
+        "tile": max((t.splat_count * (splat_bytes + (t.level == 0) * extra_bytes) for t in scene.tiles), default=0),
+        "version": sum(tile.splat_count for tile in coarsest) * (splat_bytes + with_extras * extra_bytes),
+    }
+    for level in sorted(_spec.RESOURCE_LEVEL_NAMES):
+        bounds = {name: getattr(_spec, f"RESOURCE_LEVEL_{name.upper()}_BYTES").get(level) for name in sizes}
+        if all(bound is None or sizes[name] <= bound for name, bound in bounds.items()):
+            return level
+    raise AssertionError("the highest level has bounds")
 
 
 def _cuts(scene: Scene) -> list[tuple[str, list[int] | str]]:

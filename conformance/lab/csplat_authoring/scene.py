@@ -208,6 +208,7 @@ class Scene:
         gap: bytes between the index and the first chunk.
         trailing: bytes after the end.
         tails: tails (IDX-9) by kind of record, or `head`.
+        resource_level: registry value; None: the lowest that the contents allow.
     """
 
     attributes: dict[int, Attribute]
@@ -226,6 +227,7 @@ class Scene:
     gap: bytes = b""
     trailing: bytes = b""
     tails: tuple[tuple[str, bytes], ...] = ()
+    resource_level: int | None = None
 
     @property
     def finest(self) -> Scene:

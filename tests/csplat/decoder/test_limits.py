@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of csplat.decoder.limits.
 
-Also: csplat.decoder.codebooks.
+Also: csplat.decoder.budget, csplat.decoder.codebooks.
 """
 
 from dataclasses import replace

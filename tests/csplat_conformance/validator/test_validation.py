@@ -2,8 +2,8 @@
 """The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects.
 
 Also: csplat_conformance.validator.ancillary_chunks, csplat_conformance.validator.index,
-csplat_conformance.validator.streams, csplat_conformance.validator.tiles, csplat_conformance.validator.tree,
-csplat_conformance.validator.values.
+csplat_conformance.validator.resource_level, csplat_conformance.validator.streams, csplat_conformance.validator.tiles,
+csplat_conformance.validator.tree, csplat_conformance.validator.values.
 """
 
 import json
@@ -85,6 +85,7 @@ def test_recommendations_that_are_not_followed_are_remarked(sound):
 def test_all_defects_of_a_file_are_reported_at_their_fields():
     changes = {
         "header.profile": 9,
+        "header.resource_level": 9,
         "header.reserved_0": 1,
         "index.scene_flags": 0x08,
         "index.unit_metres": -1.0,

@@ -21,7 +21,7 @@ UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which
 NOT_ABOUT_FILES = {
     "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5",
     "CHK-6", "CHK-7", "CHK-8", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
-    "TRE-9",
+    "TRE-9", "LIM-2",
 }  # fmt: skip
 
 

@@ -179,6 +179,7 @@ class FileDescription:
         return {
             "format": f"csplat {header.version[0]}.{header.version[1]}",
             "profile": header.profile,
+            "resource_level": header.resource_level,
             "size_bytes": header.file_size,
             "bytes_per_splat": self.bytes_per_splat,
             "splats": header.splat_count,
@@ -326,11 +327,12 @@ def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, Attrib
 
 
 def format_headline(file: FileDescription) -> str:
-    """Return a headline: format version, profile, size, bytes per splat."""
+    """Return a headline: format version, profile, resource level, size, bytes per splat."""
     header, per_splat = file.header, file.bytes_per_splat
     average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
     version = f"csplat {header.version[0]}.{header.version[1]}"
-    return f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}"
+    level = f"resource level {header.resource_level}"
+    return f"{version}, profile {header.profile}, {level}, {format_bytes(header.file_size)}{average}"
 
 
 def describe_scene(file: FileDescription) -> dict[str, str]:

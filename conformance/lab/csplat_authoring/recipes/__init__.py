@@ -16,6 +16,7 @@ from csplat_authoring.recipes.deflate_streams import invalid_deflate_recipes, va
 from csplat_authoring.recipes.extreme import edge_recipes, extreme_stream_recipes
 from csplat_authoring.recipes.invalid_bytes import invalid_bytes_recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
+from csplat_authoring.recipes.resource_levels import invalid_level_recipes, valid_level_recipes
 from csplat_authoring.recipes.texts import bad_text_recipes, good_text_recipes
 from csplat_authoring.recipes.valid import combined_recipes, valid_recipes, valid_stream_recipes
 from csplat_authoring.reference import expected
@@ -36,13 +37,16 @@ def sound_recipes() -> list[Recipe]:
         edge_recipes,
         good_text_recipes,
         rendered_recipes,
+        valid_level_recipes,
     )
     return _sort_by_manifest([*declared_recipes("valid", "extreme"), *(recipe for make in makers for recipe in make())])
 
 
 def all_recipes() -> list[Recipe]:
     """Return every recipe, in the order of the manifest."""
-    makers = (boundary_recipes, invalid_deflate_recipes, bad_text_recipes, invalid_bytes_recipes)
+    makers = (
+        boundary_recipes, invalid_deflate_recipes, bad_text_recipes, invalid_bytes_recipes, invalid_level_recipes,
+    )  # fmt: skip
     invalid = [*declared_recipes("invalid"), *(recipe for make in makers for recipe in make())]
     return _sort_by_manifest([*sound_recipes(), *invalid])
 
@@ -58,7 +62,7 @@ def exact_floats(name: str) -> dict[str, NDArray[Any]]:
     """Return the float arrays of a vector; the manifest has only their hashes."""
     made = _scenes()[name]
     assert made is not None, f"{name} has no values"
-    return expected(made).floats
+    return expected(made, 0).floats
 
 
 @cache

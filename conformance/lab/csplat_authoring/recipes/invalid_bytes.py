@@ -151,7 +151,8 @@ def _arrays_beyond_budget() -> Recipe:
 
     @cache
     def data() -> bytes:
-        built = build(scene(3, tiles=[*[replace(one, blocks=run)] * tiles, one]))
+        made = scene(3, tiles=[*[replace(one, blocks=run)] * tiles, one], resource_level=_spec.RESOURCE_LEVEL_C)
+        built = build(made)
         n = _spec.TILE_SPLATS_MAX
         changes = {"index.splat_count": tiles * n + 1}
         for i in range(tiles):
