@@ -195,8 +195,12 @@ def python_enum(enum: Registry) -> list[str]:
 
 
 def enum_tables(enum: Registry) -> list[tuple[str, str, str, list[tuple[Any, Any]]]]:
-    """Return the look-up tables of an enumeration: (name, key type, value type, pairs); reserved entries have none."""
+    """Return the look-up tables of an enumeration: (name, key type, value type, pairs).
+
+    Only `reserved`, which has the names of reserved entries, includes these.
+    """
     used = [entry for entry in enum["entries"] if entry.get("state", "used") == "used"]
+    reserved = [(entry["id"], entry["name"]) for entry in enum["entries"] if entry not in used]
     key_type = "bytes" if enum["name"] == "chunk" else type(used[0]["id"]).__name__
     tables = []
     names = {"name": "names"}
@@ -206,7 +210,7 @@ def enum_tables(enum: Registry) -> list[tuple[str, str, str, list[tuple[Any, Any
         sample = next(entry[key] for entry in used if key in entry)
         value_type = "tuple[str, ...]" if isinstance(sample, list) else type(sample).__name__
         tables.append((names.get(key, key), key_type, value_type, [(e["id"], e[key]) for e in used if key in e]))
-    return tables
+    return tables + [("reserved", key_type, "str", reserved)] * bool(reserved)
 
 
 def python_value(value: Any, enum_name: str = "") -> str:
@@ -340,7 +344,7 @@ def rules_of(registry: Registry) -> Iterator[tuple[str, Field, Registry]]:
                 kind = next((key for key in USUAL_ERRORS if key in rule), "none")
                 found = {"error": USUAL_ERRORS.get(kind)} | rule
                 where = f"registry: {structure['name']}.{name}: {rule}"
-                if set(found) - {kind, "of", "clause", "error", "skipped"} or found["error"] not in codes:
+                if set(found) - {kind, "of", "clause", "error", "skipped", "ancillary"} or found["error"] not in codes:
                     raise SystemExit(f"{where}: expected one of {', '.join(USUAL_ERRORS)}, and of, clause, error")
                 if kind == "range" and not fits(found["range"], field[1]):
                     raise SystemExit(f"{where}: not a range of {field[1]}")
@@ -564,7 +568,7 @@ def constant_table(registry: Registry) -> str:
 
 
 def enum_table(enum: Registry) -> str:
-    extra = [name for name, _, _, _ in enum_tables(enum) if name != "names"]
+    extra = [name for name, _, _, _ in enum_tables(enum) if name not in ("names", "reserved")]
     lines = [
         "| id | name | " + "".join(f"{name.replace('_', ' ')} | " for name in extra) + "meaning |",
         "|---|---|" + "---|" * len(extra) + "---|",
@@ -609,7 +613,7 @@ def values_text(rule: Registry, registry: Registry) -> str:
         title = enum_named(registry, name)["title"].split(" (")[0]
         registered = f"registry of {title[0].lower()}{title[1:]}"
         if "enum" in rule:
-            return registered
+            return registered + "; from ANCILLARY_ID_MIN on, any" * rule.get("ancillary", False)
         return f"{registered}; other bits reserved, 0" + ", but for those of ANC-1" * ("skipped" in rule)
     low, high = rule["range"]
     if low == high:

@@ -71,8 +71,16 @@
 #define SPEC_RESOURCE_LEVEL_B_VERSION_BYTES INT64_C(4294967296)
 #define SPEC_CHUNK_FLAG_CRITICAL 1
 #define SPEC_CHUNK_FLAG_SAFE_TO_COPY 2
-#define SPEC_SCENE_FLAG_ANTIALIASED 1
 #define SPEC_SCENE_FLAG_FLAT 2
+#define SPEC_KERNEL_ELLIPSE 0
+#define SPEC_KERNEL_SURFEL 1
+#define SPEC_KERNEL_BETA 2
+#define SPEC_KERNEL_TRIANGLE 3
+#define SPEC_PROJECTION_PERSPECTIVE 0
+#define SPEC_ANTIALIASING_NONE 0
+#define SPEC_ANTIALIASING_MIP 1
+#define SPEC_COLOUR_SPACE_SRGB_REC709_DISPLAY 0
+#define SPEC_COLOUR_SPACE_LIN_REC709_DISPLAY 1
 #define SPEC_DIRECTION_UNSPECIFIED 0
 #define SPEC_DIRECTION_RIGHT 1
 #define SPEC_DIRECTION_LEFT 2
@@ -152,7 +160,7 @@
 #define SPEC_HEADER_AT_INDEX_SIZE 16
 #define SPEC_HEADER_AT_FILE_SIZE 20
 #define SPEC_HEADER_AT_HEADER_CRC 28
-#define SPEC_INDEX_HEAD_SIZE 64
+#define SPEC_INDEX_HEAD_SIZE 68
 #define SPEC_INDEX_HEAD_AT_HEAD_SIZE 0
 #define SPEC_INDEX_HEAD_AT_ATTRIBUTE_SIZE 1
 #define SPEC_INDEX_HEAD_AT_CODEBOOK_SIZE 2
@@ -160,7 +168,7 @@
 #define SPEC_INDEX_HEAD_AT_DIRECTORY_SIZE 4
 #define SPEC_INDEX_HEAD_AT_TILE_SIZE 5
 #define SPEC_INDEX_HEAD_AT_LAYER_SIZE 6
-#define SPEC_INDEX_HEAD_AT_RESERVED_0 7
+#define SPEC_INDEX_HEAD_AT_KERNEL 7
 #define SPEC_INDEX_HEAD_AT_SPLAT_COUNT 8
 #define SPEC_INDEX_HEAD_AT_TILE_COUNT 16
 #define SPEC_INDEX_HEAD_AT_DIRECTORY_COUNT 20
@@ -172,6 +180,10 @@
 #define SPEC_INDEX_HEAD_AT_AXES 29
 #define SPEC_INDEX_HEAD_AT_UNIT_METRES 32
 #define SPEC_INDEX_HEAD_AT_ORIGIN 40
+#define SPEC_INDEX_HEAD_AT_PROJECTION 64
+#define SPEC_INDEX_HEAD_AT_ANTIALIASING 65
+#define SPEC_INDEX_HEAD_AT_COLOUR_SPACE 66
+#define SPEC_INDEX_HEAD_AT_RESERVED_0 67
 #define SPEC_ATTRIBUTE_RECORD_SIZE 16
 #define SPEC_ATTRIBUTE_RECORD_AT_ATTRIBUTE 0
 #define SPEC_ATTRIBUTE_RECORD_AT_MAPPING 1
@@ -1047,6 +1059,13 @@ static int read_header(csplat *d)
     return 1;
 }
 
+/* Refuse values between the last known one and those that need not be known (ANC-4). */
+static int check_hint(csplat *d, unsigned value, unsigned last, uint64_t offset)
+{
+    return value <= last || value >= SPEC_ANCILLARY_ID_MIN ||
+           fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", offset, "the value %u of projection, antialiasing or colour_space", value);
+}
+
 /* Read the properties of the scene: the index head without sizes and counts. */
 static int read_facts(csplat *d, const uint8_t *p)
 {
@@ -1054,16 +1073,27 @@ static int read_facts(csplat *d, const uint8_t *p)
     const uint64_t at = SPEC_HEADER_SIZE;
     csplat_info *info = &d->info;
     const uint8_t *axes = p + SPEC_INDEX_HEAD_AT_AXES;
-    unsigned flags = p[SPEC_INDEX_HEAD_AT_SCENE_FLAGS], lines = 0;
+    unsigned flags = p[SPEC_INDEX_HEAD_AT_SCENE_FLAGS], kernel = p[SPEC_INDEX_HEAD_AT_KERNEL], lines = 0;
     TRY(reserved(d, p + SPEC_INDEX_HEAD_AT_RESERVED_0, 1, at + SPEC_INDEX_HEAD_AT_RESERVED_0));
+    if (kernel == SPEC_KERNEL_SURFEL || kernel == SPEC_KERNEL_BETA || kernel == SPEC_KERNEL_TRIANGLE)
+        return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at + SPEC_INDEX_HEAD_AT_KERNEL, "the kernel %s is not supported",
+                    kernel == SPEC_KERNEL_SURFEL ? "SURFEL" : kernel == SPEC_KERNEL_BETA ? "BETA" : "TRIANGLE");
+    if (kernel != SPEC_KERNEL_ELLIPSE)
+        return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at + SPEC_INDEX_HEAD_AT_KERNEL, "the kernel %u", kernel);
+    info->projection = p[SPEC_INDEX_HEAD_AT_PROJECTION];
+    info->antialiasing = p[SPEC_INDEX_HEAD_AT_ANTIALIASING];
+    info->colour_space = p[SPEC_INDEX_HEAD_AT_COLOUR_SPACE];
+    TRY(check_hint(d, info->projection, SPEC_PROJECTION_PERSPECTIVE, at + SPEC_INDEX_HEAD_AT_PROJECTION));
+    TRY(check_hint(d, info->antialiasing, SPEC_ANTIALIASING_MIP, at + SPEC_INDEX_HEAD_AT_ANTIALIASING));
+    TRY(check_hint(d, info->colour_space, SPEC_COLOUR_SPACE_LIN_REC709_DISPLAY, at + SPEC_INDEX_HEAD_AT_COLOUR_SPACE));
     info->splat_count = get_u64(p + SPEC_INDEX_HEAD_AT_SPLAT_COUNT);
     info->sh_degree = p[SPEC_INDEX_HEAD_AT_SH_DEGREE];
     if (info->sh_degree > SPEC_SH_DEGREE_MAX)
         return fail(d, CSPLAT_E_UNSUPPORTED, "IDX-3", at + SPEC_INDEX_HEAD_AT_SH_DEGREE, "an SH degree of %u",
                     info->sh_degree);
-    if (flags & ~(unsigned)(SPEC_SCENE_FLAG_ANTIALIASED | SPEC_SCENE_FLAG_FLAT | SPEC_ANCILLARY_SCENE_FLAGS))
+    if (flags & ~(unsigned)(SPEC_SCENE_FLAG_FLAT | SPEC_ANCILLARY_SCENE_FLAGS))
         return fail(d, CSPLAT_E_RESERVED, "RES-1", at + SPEC_INDEX_HEAD_AT_SCENE_FLAGS, "scene_flags 0x%02x", flags);
-    info->antialiased = (flags & SPEC_SCENE_FLAG_ANTIALIASED) != 0;
+    info->antialiased = info->antialiasing == SPEC_ANTIALIASING_MIP;
     info->flat = (flags & SPEC_SCENE_FLAG_FLAT) != 0;
     for (int i = 0; i < 3; i++)
         if (axes[i] > SPEC_DIRECTION_BACK)

@@ -112,6 +112,7 @@ typedef struct csplat_info {
     uint32_t coarse_tile_count; /* of higher levels; their numbers follow */
     uint8_t sh_degree;
     uint8_t antialiased, flat; /* how to render: filter of Mip-Splatting, 2DGS */
+    uint8_t projection, antialiasing, colour_space; /* numbers of the specification, 12, possibly unknown from 128 on */
     char axes[4];              /* directions of +x, +y, +z: letters of R L U D F B; "" if unknown */
     double unit_metres;        /* 0 if unknown */
     double origin[3];          /* the means are relative to it; it is not added */

@@ -30,7 +30,7 @@ RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
 EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
 NO_PARENT: Final = 4294967295  # `parent` of a node that has none, 2^32 − 1
-ANCILLARY_ID_MIN: Final = 128  # least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
+ANCILLARY_ID_MIN: Final = 128  # least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
 ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
@@ -43,6 +43,7 @@ JSON_VALUE_COST: Final = 64  # memory that STR-8 counts for each comma, colon, a
 PROFILE_BASE: Final = 0
 PROFILE_ARCHIVE: Final = 1  # reserved
 PROFILE_NAMES: Final[dict[int, str]] = {0: "base"}
+PROFILE_RESERVED: Final[dict[int, str]] = {1: "archive"}
 
 # Resource levels
 RESOURCE_LEVEL_A: Final = 1
@@ -60,9 +61,30 @@ CHUNK_FLAG_SAFE_TO_COPY: Final = 2
 CHUNK_FLAG_NAMES: Final[dict[int, str]] = {1: "critical", 2: "safe_to_copy"}
 
 # Scene flags (bit masks)
-SCENE_FLAG_ANTIALIASED: Final = 1
 SCENE_FLAG_FLAT: Final = 2
-SCENE_FLAG_NAMES: Final[dict[int, str]] = {1: "antialiased", 2: "flat"}
+SCENE_FLAG_NAMES: Final[dict[int, str]] = {2: "flat"}
+
+# Kernels
+KERNEL_ELLIPSE: Final = 0
+KERNEL_SURFEL: Final = 1  # reserved
+KERNEL_BETA: Final = 2  # reserved
+KERNEL_TRIANGLE: Final = 3  # reserved
+KERNEL_NAMES: Final[dict[int, str]] = {0: "ellipse"}
+KERNEL_RESERVED: Final[dict[int, str]] = {1: "surfel", 2: "beta", 3: "triangle"}
+
+# Projections
+PROJECTION_PERSPECTIVE: Final = 0
+PROJECTION_NAMES: Final[dict[int, str]] = {0: "perspective"}
+
+# Antialiasing
+ANTIALIASING_NONE: Final = 0
+ANTIALIASING_MIP: Final = 1
+ANTIALIASING_NAMES: Final[dict[int, str]] = {0: "none", 1: "mip"}
+
+# Colour spaces
+COLOUR_SPACE_SRGB_REC709_DISPLAY: Final = 0
+COLOUR_SPACE_LIN_REC709_DISPLAY: Final = 1
+COLOUR_SPACE_NAMES: Final[dict[int, str]] = {0: "srgb_rec709_display", 1: "lin_rec709_display"}
 
 # Axis directions
 DIRECTION_UNSPECIFIED: Final = 0
@@ -240,7 +262,7 @@ class IndexHead(NamedTuple):
     directory_size: int
     tile_size: int
     layer_size: int
-    reserved_0: int
+    kernel: int
     splat_count: int
     tile_count: int
     directory_count: int
@@ -252,22 +274,26 @@ class IndexHead(NamedTuple):
     axes: bytes
     unit_metres: float
     origin: tuple[float, float, float]
+    projection: int
+    antialiasing: int
+    colour_space: int
+    reserved_0: int
 
 
-INDEX_HEAD_STRUCT: Final = struct.Struct("<BBBBBBBBQIHHHBBB3sdddd")
-INDEX_HEAD_SIZE: Final = 64
-INDEX_HEAD_OFFSETS: Final[dict[str, int]] = {"head_size": 0, "attribute_size": 1, "codebook_size": 2, "extra_size": 3, "directory_size": 4, "tile_size": 5, "layer_size": 6, "reserved_0": 7, "splat_count": 8, "tile_count": 16, "directory_count": 20, "codebook_count": 22, "extra_count": 24, "attribute_count": 26, "sh_degree": 27, "scene_flags": 28, "axes": 29, "unit_metres": 32, "origin": 40}
+INDEX_HEAD_STRUCT: Final = struct.Struct("<BBBBBBBBQIHHHBBB3sddddBBBB")
+INDEX_HEAD_SIZE: Final = 68
+INDEX_HEAD_OFFSETS: Final[dict[str, int]] = {"head_size": 0, "attribute_size": 1, "codebook_size": 2, "extra_size": 3, "directory_size": 4, "tile_size": 5, "layer_size": 6, "kernel": 7, "splat_count": 8, "tile_count": 16, "directory_count": 20, "codebook_count": 22, "extra_count": 24, "attribute_count": 26, "sh_degree": 27, "scene_flags": 28, "axes": 29, "unit_metres": 32, "origin": 40, "projection": 64, "antialiasing": 65, "colour_space": 66, "reserved_0": 67}
 
 
 def unpack_index_head(data: bytes | bytearray | memoryview, offset: int = 0) -> IndexHead:
     """Read a IndexHead at a byte offset; raise struct.error if the data is too short."""
     v = INDEX_HEAD_STRUCT.unpack_from(data, offset)
-    return IndexHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14], v[15], v[16], v[17], (v[18], v[19], v[20]))
+    return IndexHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14], v[15], v[16], v[17], (v[18], v[19], v[20]), v[21], v[22], v[23], v[24])
 
 
 def pack_index_head(r: IndexHead) -> bytes:
-    """Return the 64 bytes of a IndexHead."""
-    return INDEX_HEAD_STRUCT.pack(r.head_size, r.attribute_size, r.codebook_size, r.extra_size, r.directory_size, r.tile_size, r.layer_size, r.reserved_0, r.splat_count, r.tile_count, r.directory_count, r.codebook_count, r.extra_count, r.attribute_count, r.sh_degree, r.scene_flags, r.axes, r.unit_metres, *r.origin)
+    """Return the 68 bytes of a IndexHead."""
+    return INDEX_HEAD_STRUCT.pack(r.head_size, r.attribute_size, r.codebook_size, r.extra_size, r.directory_size, r.tile_size, r.layer_size, r.kernel, r.splat_count, r.tile_count, r.directory_count, r.codebook_count, r.extra_count, r.attribute_count, r.sh_degree, r.scene_flags, r.axes, r.unit_metres, *r.origin, r.projection, r.antialiasing, r.colour_space, r.reserved_0)
 
 
 class AttributeRecord(NamedTuple):

@@ -46,6 +46,7 @@ part of the scene.
 | `ranks` | gsplat checkpoints: the splats of one GPU or of several are read | note |
 | `zip-names` | backslashes or capitals in the names in a SOG's zip or manifest | note |
 | `levels` | coarser levels of detail in a .csplat file: one level is read | note |
+| `colour-space`, `projection` | a .csplat file of others than csplat draws: drawn as sRGB, in perspective | note |
 | `other-scenes` | more scenes than the one that is read, in a SOG's zip or in glTF without a default scene | note |
 | `double-means` | positions in doubles or integers: an origin keeps their precision | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |

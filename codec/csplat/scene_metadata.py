@@ -9,12 +9,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from csplat import _spec
 from csplat.errors import InputError
 
 Direction = tuple[float, float, float]
 
 #: Coordinate system of a scene whose source did not specify its axes.
 UNSPECIFIED = "unspecified"
+
+#: Number of each colour space by its name, or by itself if it is not registered.
+COLOUR_SPACES = {name: value for value, name in _spec.COLOUR_SPACE_NAMES.items()}
+COLOUR_SPACES |= {str(value): value for value in range(_spec.ANCILLARY_ID_MIN, 256)}
+SRGB = _spec.COLOUR_SPACE_NAMES[_spec.COLOUR_SPACE_SRGB_REC709_DISPLAY]
+LINEAR = _spec.COLOUR_SPACE_NAMES[_spec.COLOUR_SPACE_LIN_REC709_DISPLAY]
 
 #: Keys of entries.
 COMMENTS = "comments"
@@ -43,6 +50,8 @@ class SceneMetadata:
         unit_metres: length of a scene unit in metres; `None` if unknown.
         antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
         flat: splats are discs (2DGS); the smallest scale has no meaning.
+        colour_space: `"srgb_rec709_display"`, in which 3D Gaussian splatting trains and renders, or
+            `"lin_rec709_display"` (names of KHR_gaussian_splatting), or a number of an unknown one, `"128"` to `"255"`.
         cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
             pixel centres are at +0.5. `None` if there are none.
         entries: JSON-compatible. Keys in use: `licence` (str), `comments` (list of str), `training` (a
@@ -50,13 +59,14 @@ class SceneMetadata:
             Properties return their values if these are valid.
 
     Raises:
-        InputError: the coordinate system or the unit is invalid.
+        InputError: the coordinate system, the unit or the colour space is invalid.
     """
 
     coordinate_system: str = UNSPECIFIED
     unit_metres: float | None = None
     antialiased: bool = False
     flat: bool = False
+    colour_space: str = SRGB
     cameras: Sequence[Mapping[str, Any]] | None = None
     entries: Mapping[str, Any] = field(default_factory=dict)
 
@@ -66,6 +76,9 @@ class SceneMetadata:
         unit = self.unit_metres
         if unit is not None and not (math.isfinite(unit) and unit > 0):
             raise InputError(f"unit_metres is {unit}, expected a length above 0 or None")
+        if self.colour_space not in COLOUR_SPACES:
+            known = ", ".join(_spec.COLOUR_SPACE_NAMES.values())
+            raise InputError(f"colour_space is {self.colour_space!r}, expected one of {known}")
 
     @property
     def stated_up(self) -> Direction | None:

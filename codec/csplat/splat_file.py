@@ -42,7 +42,7 @@ from csplat.model import SplatModel, trusted_model
 from csplat.packed import PackedTile
 from csplat.remote_store import open_store
 from csplat.scene import Scene
-from csplat.scene_metadata import SceneMetadata
+from csplat.scene_metadata import SRGB, SceneMetadata
 from csplat.types import F64
 
 _T = TypeVar("_T")
@@ -74,6 +74,7 @@ class SplatFile(Scene):
         self.findings, self.in_memory, self.modified_ns = [], None, 0
         if header.coarse_tiles:
             self.findings.append(_levels_finding(header, "level 0 alone is read"))
+        self.findings += _drawing_findings(header)
 
     @classmethod
     def open(cls, file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
@@ -389,6 +390,19 @@ def _levels_finding(header: SceneHeader, which: str) -> Finding:
     """Report that a file has coarser levels; `which` describes the version that is read."""
     last = max(tile.level for tile in header.coarse_tiles)
     return Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")
+
+
+def _drawing_findings(header: SceneHeader) -> list[Finding]:
+    """Report a projection or a colour space that no renderer here draws."""
+    projection = _spec.PROJECTION_NAMES.get(header.projection)
+    space = _spec.COLOUR_SPACE_NAMES.get(header.colour_space, str(header.colour_space))
+    found = []
+    if projection is None:
+        text = f"the projection is {header.projection}, which is unknown: drawn in perspective"
+        found.append(Finding("projection", 1, text, "note"))
+    if space != SRGB:
+        found.append(Finding("colour-space", 1, f"the colour space is {space}: drawn as {SRGB}", "note"))
+    return found
 
 
 def _read_head(store: Store, window: FileWindow, limits: Limits) -> bytes:

@@ -133,6 +133,13 @@ export interface Header {
   /** Splats of level 0, the scene. */
   splatCount: number;
   shDegree: number;
+  /** Shape of a splat: 'ellipse'; other kernels are refused. */
+  kernel: string;
+  /** How the splats were drawn in training (spec 4.3): numbers of its registries, or unknown ones from 128 on. */
+  projection: number;
+  antialiasing: number;
+  colourSpace: number;
+  /** Whether `antialiasing` is MIP. */
   antialiased: boolean;
   flat: boolean;
   /** Letters of the directions of +x, +y, +z ("RDF"), or empty if unknown. */

@@ -39,6 +39,12 @@ const RECORD_SIZES = /** @type {const} */ ([
   ['tile_size', spec.TILE_RECORD_SIZE],
   ['layer_size', spec.LAYER_RECORD_SIZE],
 ]);
+/** Fields whose unknown values from ANCILLARY_ID_MIN on are returned (ANC-4), with the known ones. */
+const HINTS = /** @type {const} */ ([
+  ['projection', spec.PROJECTION_NAMES],
+  ['antialiasing', spec.ANTIALIASING_NAMES],
+  ['colour_space', spec.COLOUR_SPACE_NAMES],
+]);
 const INDEX_GROWTH = 8; // memory of the parsed index, as a multiple of its bytes (approximate)
 
 /**
@@ -132,7 +138,18 @@ function readScene(head) {
     const detail = `SH degree ${head.sh_degree}, this decoder reads 0 to ${spec.SH_DEGREE_MAX}`;
     throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', detail);
   }
-  const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;
+  const { kernel: kernelId, projection, antialiasing, colour_space: colourSpace } = head;
+  const kernel = nameOf(spec.KERNEL_NAMES, kernelId);
+  if (kernel === undefined) {
+    const name = nameOf(spec.KERNEL_RESERVED, kernelId)?.toUpperCase() ?? kernelId;
+    throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.kernel, 'RES-2', `kernel ${name} is not supported`);
+  }
+  for (const [field, names] of HINTS) {
+    const value = head[field];
+    if (value < spec.ANCILLARY_ID_MIN && nameOf(names, value) === undefined)
+      throw fault(ERROR_UNSUPPORTED, at + AT_HEAD[field], 'RES-2', `${field} ${value} is not supported`);
+  }
+  const flags = spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;
   if (head.scene_flags & ~flags)
     throw fault(ERROR_RESERVED, at + AT_HEAD.scene_flags, 'RES-1', `scene flags ${head.scene_flags}`);
   const axes = [...head.axes];
@@ -152,7 +169,8 @@ function readScene(head) {
   }
   return {
     shDegree: head.sh_degree,
-    antialiased: (head.scene_flags & spec.SCENE_FLAG_ANTIALIASED) !== 0,
+    ...{ kernel, projection, antialiasing, colourSpace },
+    antialiased: antialiasing === spec.ANTIALIASING_MIP,
     flat: (head.scene_flags & spec.SCENE_FLAG_FLAT) !== 0,
     axes: axes.map((direction) => letters[direction]).join(''),
     unitMetres: Math.abs(unit), // −0 is 0

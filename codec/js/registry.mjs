@@ -20,6 +20,20 @@ export const HIGHEST_LEVEL = spec.RESOURCE_LEVEL_NAMES[spec.RESOURCE_LEVEL_C];
 export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : undefined);
 
 /**
+ * Return what a header states about drawing that no renderer here does, in words; '' if there is nothing.
+ *
+ * @param {import('./decoder.d.ts').Header} header
+ */
+export function drawnOtherwise({ projection, colourSpace }) {
+  const words = [];
+  if (projection !== spec.PROJECTION_PERSPECTIVE) words.push(`the projection ${projection} is drawn in perspective`);
+  if (colourSpace !== spec.COLOUR_SPACE_SRGB_REC709_DISPLAY) {
+    words.push(`colours of ${nameOf(spec.COLOUR_SPACE_NAMES, colourSpace) ?? colourSpace} are drawn as sRGB`);
+  }
+  return words.join(', ');
+}
+
+/**
  * Return the flags that the registry assigns to a chunk type.
  *
  * @param {string} type a known type

@@ -22,7 +22,7 @@ export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
 export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
 export const NO_PARENT = 4294967295; // `parent` of a node that has none, 2^32 − 1
-export const ANCILLARY_ID_MIN = 128; // least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
+export const ANCILLARY_ID_MIN = 128; // least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
 export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
@@ -35,6 +35,7 @@ export const JSON_VALUE_COST = 64; // memory that STR-8 counts for each comma, c
 export const PROFILE_BASE = 0;
 export const PROFILE_ARCHIVE = 1; // reserved
 export const PROFILE_NAMES = Object.freeze({ 0: 'base' });
+export const PROFILE_RESERVED = Object.freeze({ 1: 'archive' });
 
 // Resource levels
 export const RESOURCE_LEVEL_A = 1;
@@ -52,9 +53,30 @@ export const CHUNK_FLAG_SAFE_TO_COPY = 2;
 export const CHUNK_FLAG_NAMES = Object.freeze({ 1: 'critical', 2: 'safe_to_copy' });
 
 // Scene flags (bit masks)
-export const SCENE_FLAG_ANTIALIASED = 1;
 export const SCENE_FLAG_FLAT = 2;
-export const SCENE_FLAG_NAMES = Object.freeze({ 1: 'antialiased', 2: 'flat' });
+export const SCENE_FLAG_NAMES = Object.freeze({ 2: 'flat' });
+
+// Kernels
+export const KERNEL_ELLIPSE = 0;
+export const KERNEL_SURFEL = 1; // reserved
+export const KERNEL_BETA = 2; // reserved
+export const KERNEL_TRIANGLE = 3; // reserved
+export const KERNEL_NAMES = Object.freeze({ 0: 'ellipse' });
+export const KERNEL_RESERVED = Object.freeze({ 1: 'surfel', 2: 'beta', 3: 'triangle' });
+
+// Projections
+export const PROJECTION_PERSPECTIVE = 0;
+export const PROJECTION_NAMES = Object.freeze({ 0: 'perspective' });
+
+// Antialiasing
+export const ANTIALIASING_NONE = 0;
+export const ANTIALIASING_MIP = 1;
+export const ANTIALIASING_NAMES = Object.freeze({ 0: 'none', 1: 'mip' });
+
+// Colour spaces
+export const COLOUR_SPACE_SRGB_REC709_DISPLAY = 0;
+export const COLOUR_SPACE_LIN_REC709_DISPLAY = 1;
+export const COLOUR_SPACE_NAMES = Object.freeze({ 0: 'srgb_rec709_display', 1: 'lin_rec709_display' });
 
 // Axis directions
 export const DIRECTION_UNSPECIFIED = 0;
@@ -213,10 +235,10 @@ export function unpackHeader(view, at) {
   };
 }
 
-export const INDEX_HEAD_SIZE = 64;
-export const INDEX_HEAD_OFFSETS = Object.freeze({ head_size: 0, attribute_size: 1, codebook_size: 2, extra_size: 3, directory_size: 4, tile_size: 5, layer_size: 6, reserved_0: 7, splat_count: 8, tile_count: 16, directory_count: 20, codebook_count: 22, extra_count: 24, attribute_count: 26, sh_degree: 27, scene_flags: 28, axes: 29, unit_metres: 32, origin: 40 });
+export const INDEX_HEAD_SIZE = 68;
+export const INDEX_HEAD_OFFSETS = Object.freeze({ head_size: 0, attribute_size: 1, codebook_size: 2, extra_size: 3, directory_size: 4, tile_size: 5, layer_size: 6, kernel: 7, splat_count: 8, tile_count: 16, directory_count: 20, codebook_count: 22, extra_count: 24, attribute_count: 26, sh_degree: 27, scene_flags: 28, axes: 29, unit_metres: 32, origin: 40, projection: 64, antialiasing: 65, colour_space: 66, reserved_0: 67 });
 export const INDEX_HEAD_STRIDES = Object.freeze({ origin: 8 });
-export const INDEX_HEAD_RESERVED = Object.freeze({ reserved_0: 7 });
+export const INDEX_HEAD_RESERVED = Object.freeze({ reserved_0: 67 });
 /**
  * Head of the index. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -231,7 +253,7 @@ export function unpackIndexHead(view, at) {
     directory_size: view.getUint8(at + 4),
     tile_size: view.getUint8(at + 5),
     layer_size: view.getUint8(at + 6),
-    reserved_0: view.getUint8(at + 7),
+    kernel: view.getUint8(at + 7),
     splat_count: view.getBigUint64(at + 8, true),
     tile_count: view.getUint32(at + 16, true),
     directory_count: view.getUint16(at + 20, true),
@@ -243,6 +265,10 @@ export function unpackIndexHead(view, at) {
     axes: new Uint8Array(view.buffer, view.byteOffset + at + 29, 3),
     unit_metres: view.getFloat64(at + 32, true),
     origin: [view.getFloat64(at + 40, true), view.getFloat64(at + 48, true), view.getFloat64(at + 56, true)],
+    projection: view.getUint8(at + 64),
+    antialiasing: view.getUint8(at + 65),
+    colour_space: view.getUint8(at + 66),
+    reserved_0: view.getUint8(at + 67),
   };
 }
 

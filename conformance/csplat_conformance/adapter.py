@@ -168,7 +168,7 @@ def _raw_bytes(array: NDArray[Any]) -> bytes:
 
 def _manifest_header(header: Any) -> dict[str, Any]:
     """Return the header fields in the form of the manifest."""
-    flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
+    flags = {_spec.SCENE_FLAG_FLAT: header.flat}
     return {
         "profile": header.profile,
         "resource_level": header.resource_level,
@@ -179,6 +179,10 @@ def _manifest_header(header: Any) -> dict[str, Any]:
         "axes": "" if header.coordinate_system == "unspecified" else header.coordinate_system,
         "unit_metres": header.unit_metres or 0.0,
         "origin": list(header.origin),
+        "kernel": header.kernel,
+        "projection": header.projection,
+        "antialiasing": header.antialiasing,
+        "colour_space": header.colour_space,
     }
 
 

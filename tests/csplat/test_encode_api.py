@@ -91,7 +91,7 @@ def test_errors_of_means_in_doubles_are_declared_against_the_doubles(make_model)
 def test_all_metadata_decode(make_model):
     given = {
         "coordinate_system": "RDF", "unit_metres": 0.5, "antialiased": True,
-        "flat": True, "entries": {"title": "Übung", "comments": ["one"]},
+        "flat": True, "entries": {"title": "Übung", "comments": ["one"]}, "colour_space": "lin_rec709_display",
         "cameras": [{"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4}],
     }  # fmt: skip
     decoded, _ = round_trip(make_model(20, 1, **given, origin=(4.5e6, -1e7, 12.25)))

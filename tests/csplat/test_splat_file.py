@@ -22,6 +22,7 @@ from csplat.decoder import Limits, iter_tiles
 from csplat.file_source import PageReleaser, map_file
 from csplat.remote_store import open_store
 from csplat.splat_file import SplatFile
+from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
@@ -342,3 +343,11 @@ def test_extract_reads_standard_input_and_writes_standard_output(data, box):
     assert 1 == short.exit_code
     assert short.stderr.startswith("error: standard input: the file ends too early")
     assert "standard input is a PLY" in ply.stderr
+
+
+def test_ways_of_drawing_that_no_renderer_has_are_findings():
+    vectors = {vector.name.removeprefix("valid/"): vector for vector in load()}
+    expected = {"rich": [], "scene_facts": ["colour-space"], "ancillary_hints": ["projection", "colour-space"]}
+    for name, found in expected.items():
+        with csplat.open(vectors[name].data) as scene:
+            assert found == [finding.id for finding in scene.findings]

@@ -219,7 +219,8 @@ def test_valid_vectors_hold_both_ends_of_each_range(valid):
 def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
     def check(rule):
         values = {value for built in valid(rule.structure) for value in held(built, rule)}
-        if (rule.structure, rule.field) in {("extra_record", "dtype"), ("layer_record", "layer")}:
+        ancillary = {"dtype", "layer", "projection", "antialiasing", "colour_space"}  # ANC-2 to ANC-4
+        if rule.field in ancillary:
             values = {value for value in values if value < _spec.ANCILLARY_ID_MIN}
         assert set(rule.used) == values
 
@@ -343,6 +344,12 @@ def test_every_kind_type_flag_direction_measure_and_degree_occurs():
     assert set(_spec.CHUNK_NAMES) - {b"TILE", b"CODB", b"TREE"} <= {chunk.type for s in scenes for chunk in s.chunks}
     measures = {m for s in scenes for chunk in s.chunks if chunk.errors for m, _, _ in chunk.errors.records}
     assert set(_spec.MEASURE_NAMES) == measures
+    known = {
+        "kernel": _spec.KERNEL_NAMES, "projection": _spec.PROJECTION_NAMES,
+        "antialiasing": _spec.ANTIALIASING_NAMES, "colour_space": _spec.COLOUR_SPACE_NAMES,
+    }  # fmt: skip
+    for name, values in known.items():
+        assert set(values) == {getattr(scene, name) for scene in scenes} & set(range(_spec.ANCILLARY_ID_MIN))
     for bit in _spec.SCENE_FLAG_NAMES:
         assert {True, False} == {bool(scene.scene_flags & bit) for scene in scenes}
 

@@ -91,7 +91,7 @@ def test_a_faulty_renderer_is_below_the_required_psnr(name, change):
     recipe = next(recipe for recipe in rendered_recipes() if recipe.name == name)
     made = expected(recipe.scene, 0)
     floats = made.floats | (change(made.floats) if change else {})
-    antialiased = bool(made.header["scene_flags"]) and change is not None
+    antialiased = bool(made.header["antialiasing"]) and change is not None
 
     def score(number, view):
         reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())

@@ -353,7 +353,7 @@ def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):
 
 
 #: Contents that the help and the guide call `header`.
-HEADER = {"coordinate_system", "origin", "unit_metres", "metadata", "antialiased", "flat"}
+HEADER = {"coordinate_system", "origin", "unit_metres", "metadata", "antialiased", "flat", "colour_space"}
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // One call of the engine's `open`: receives a scene from the worker and tracks its parts.
 
+import { drawnOtherwise } from '../../codec/js/registry.mjs';
 import { coarseBounds, fineBounds } from './bounds.mjs';
 import { EngineError, E_LIMIT } from './engine_error.mjs';
 import { expandedBytes } from './statistics.mjs';
@@ -106,6 +107,8 @@ export class SceneLoad {
   #takeHeader({ opened: { header, description, roots, pages } }, renderer) {
     const { splatCount, fileSize, shDegree, tiles } = header;
     const [opacities, , quats] = header.attributes;
+    const otherwise = drawnOtherwise(header);
+    if (otherwise) console.warn(`csplat: ${otherwise}`);
     try {
       renderer.allocate({
         tiles: [...tiles, ...header.coarseTiles],

@@ -96,8 +96,11 @@ static void put_header(const csplat_info *info)
     fprintf(file, "{\"profile\": \"base\", \"resource_level\": \"%c\", ", info->resource_level);
     fprintf(file, "\"splat_count\": %llu, \"tile_count\": %lu, \"sh_degree\": %u, ",
             (unsigned long long)info->splat_count, (unsigned long)tiles_of(info), info->sh_degree);
-    fprintf(file, "\"scene_flags\": [%s%s%s], ", info->antialiased ? "\"antialiased\"" : "",
-            info->antialiased && info->flat ? ", " : "", info->flat ? "\"flat\"" : "");
+    fprintf(file, "\"scene_flags\": [%s], \"kernel\": \"ellipse\", ", info->flat ? "\"flat\"" : "");
+    fprintf(file, "\"projection\": %u, \"antialiasing\": %u, \"colour_space\": %u, ", info->projection, info->antialiasing,
+            info->colour_space);
+    if (info->antialiased != (info->antialiasing == 1))
+        die("antialiased differs from antialiasing");
     fprintf(file, "\"axes\": \"%s\", \"unit_metres\": %.17g, \"origin\": [%.17g, %.17g, %.17g]}\n", info->axes,
             info->unit_metres, info->origin[0], info->origin[1], info->origin[2]);
     fclose(file);

@@ -96,7 +96,9 @@ class SceneHeader:
         index_size: size of the index, bytes.
         splat_count: N, the splats of level 0.
         sh_degree: 0 to 4.
-        antialiased, flat, coordinate_system, unit_metres, origin: as in `SplatModel`.
+        kernel: name of the kernel, `ellipse`.
+        projection, antialiasing, colour_space: values of their registries, or unknown numbers from 128 on (spec ANC-4).
+        flat, coordinate_system, unit_metres, origin: as in `SplatModel`.
         attributes: attribute records, ids ascending.
         codebooks: codebook records, ids ascending.
         extras: extra columns.
@@ -112,7 +114,10 @@ class SceneHeader:
     index_size: int
     splat_count: int
     sh_degree: int
-    antialiased: bool
+    kernel: str
+    projection: int
+    antialiasing: int
+    colour_space: int
     flat: bool
     coordinate_system: str
     unit_metres: float | None
@@ -128,6 +133,11 @@ class SceneHeader:
     def all_tiles(self) -> tuple[Tile, ...]:
         """Tiles of all levels, in the order of the index."""
         return self.tiles + self.coarse_tiles
+
+    @property
+    def antialiased(self) -> bool:
+        """True if trained with the mip-splatting low-pass filter."""
+        return self.antialiasing == _spec.ANTIALIASING_MIP
 
     def attribute(self, attribute: int) -> _spec.AttributeRecord:
         """Return an attribute's record; raise `KeyError` for a band above the scene's degree."""
@@ -247,7 +257,8 @@ def read_file_header(view: memoryview, level_max: str = HIGHEST_LEVEL) -> _spec.
     crc_at = offsets["header_crc"]
     _check_crc(view[:crc_at], header.header_crc, crc_at, "HDR-3")
     if header.profile not in _spec.PROFILE_NAMES:
-        raise UnsupportedError(f"profile {header.profile}", offset=offsets["profile"], clause="HDR-4")
+        profile = _spec.PROFILE_RESERVED.get(header.profile, str(header.profile)).upper()
+        raise UnsupportedError(f"profile {profile}", offset=offsets["profile"], clause="HDR-4")
     level, level_at = _spec.RESOURCE_LEVEL_NAMES.get(header.resource_level), offsets["resource_level"]
     if level is None:
         raise UnsupportedError(f"resource level {header.resource_level}", offset=level_at, clause="RES-2")

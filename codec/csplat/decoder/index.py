@@ -50,6 +50,12 @@ _RECORD_SIZES: Final = {
     "tile_size": _spec.TILE_RECORD_SIZE,
     "layer_size": _spec.LAYER_RECORD_SIZE,
 }
+#: Fields of the index head whose unknown values from ANCILLARY_ID_MIN on are returned (ANC-4), and the known values.
+_HINTS: Final = {
+    "projection": _spec.PROJECTION_NAMES,
+    "antialiasing": _spec.ANTIALIASING_NAMES,
+    "colour_space": _spec.COLOUR_SPACE_NAMES,
+}
 _SINGLE_CHUNKS = (
     _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS, _spec.CHUNK_TREE,
 )  # fmt: skip
@@ -112,7 +118,10 @@ def parse_header(view: memoryview, *, whole: bool, limits: Limits | None = None)
         index_size=file.index_size,
         splat_count=head.splat_count,
         sh_degree=head.sh_degree,
-        antialiased=bool(head.scene_flags & _spec.SCENE_FLAG_ANTIALIASED),
+        kernel=_spec.KERNEL_NAMES[head.kernel],
+        projection=head.projection,
+        antialiasing=head.antialiasing,
+        colour_space=head.colour_space,
         flat=bool(head.scene_flags & _spec.SCENE_FLAG_FLAT),
         coordinate_system=letters or _spec.DIRECTION_NAMES[_spec.DIRECTION_UNSPECIFIED],
         unit_metres=head.unit_metres or None,
@@ -129,12 +138,19 @@ def parse_header(view: memoryview, *, whole: bool, limits: Limits | None = None)
 
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:
-    """Check the index head at offset `at`: RES-1, IDX-3 to IDX-6, IDX-8."""
+    """Check the index head at offset `at`: RES-1, RES-2, IDX-3 to IDX-6, IDX-8."""
     offsets = _spec.INDEX_HEAD_OFFSETS
     check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
             refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
+    if head.kernel not in _spec.KERNEL_NAMES:
+        kernel = _spec.KERNEL_RESERVED.get(head.kernel, str(head.kernel)).upper()
+        raise UnsupportedError(f"kernel {kernel}", offset=at + offsets["kernel"], clause="RES-2")
+    for name, known in _HINTS.items():
+        value = getattr(head, name)
+        if value < _spec.ANCILLARY_ID_MIN and value not in known:
+            raise UnsupportedError(f"{name} {value}", offset=at + offsets[name], clause="RES-2")
     if head.sh_degree > _spec.SH_DEGREE_MAX:
         subject = f"SH degree {head.sh_degree} (this decoder reads 0 to {_spec.SH_DEGREE_MAX})"
         raise UnsupportedError(subject, offset=at + offsets["sh_degree"], clause="IDX-3")

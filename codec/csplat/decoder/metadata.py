@@ -89,6 +89,7 @@ def scene_metadata(view: memoryview, header: SceneHeader, limits: Limits) -> Sce
         unit_metres=header.unit_metres,
         antialiased=header.antialiased,
         flat=header.flat,
+        colour_space=_spec.COLOUR_SPACE_NAMES.get(header.colour_space, str(header.colour_space)),
         entries=json_chunk(view, header, _spec.CHUNK_METADATA, limits.json_bytes) or {},
         cameras=json_chunk(view, header, _spec.CHUNK_CAMERAS, limits.json_bytes),
     )

@@ -265,11 +265,14 @@ def scene_fields(
     books = [book for book in header.codebooks if book.codebook_id in codebook_ids]
     return SceneFields(
         sh_degree=header.sh_degree,
-        scene_flags=header.antialiased * _spec.SCENE_FLAG_ANTIALIASED | header.flat * _spec.SCENE_FLAG_FLAT,
+        scene_flags=header.flat * _spec.SCENE_FLAG_FLAT,
         axes=bytes(head.axes),
         unit_metres=head.unit_metres,
         origin=header.origin,
         attributes=header.attributes,
+        antialiasing=header.antialiasing,
+        colour_space=header.colour_space,
+        projection=header.projection,
         extras=extras,
         codebooks=[
             IndexedCodebook(book.codebook_id, book.kind, (book.band_first, book.band_last), book.size) for book in books

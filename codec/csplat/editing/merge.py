@@ -51,7 +51,10 @@ from csplat.scene_metadata import CONTRADICTS, UNSPECIFIED, SceneMetadata
 from csplat.splat_file import SplatFile
 
 #: Fields that must be equal because they determine how all splats of a file are rendered: words for messages, name.
-_SHARED_FIELDS = (("units", "unit_metres"), ("antialiasing", "antialiased"), ("flatness", "flat"))
+_SHARED_FIELDS = (
+    ("units", "unit_metres"), ("antialiasing", "antialiased"), ("flatness", "flat"), ("colour spaces", "colour_space"),
+    ("projections", "projection"), ("antialiasing", "antialiasing"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def merge(
 
     Raises:
         InputError: there are fewer than two files, or they contradict each other in axes, up direction, unit,
-            antialiasing or flatness.
+            antialiasing, flatness, colour space or projection.
         FormatError, UnsupportedError, LimitError, StoreError, OSError: as in `csplat.open`, and errors of reading.
     """
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
@@ -311,6 +314,7 @@ def _merge_scenes(scenes: Sequence[SplatFile]) -> Scene:
             unit_metres=next((header.unit_metres for header in headers if header.unit_metres), None),
             antialiased=headers[0].antialiased,
             flat=headers[0].flat,
+            colour_space=scenes[0].metadata.colour_space,
             cameras=_common_cameras(scenes),
             entries=_common_entries([scene.metadata.entries for scene in scenes]),
         ),

@@ -101,6 +101,9 @@ class SceneFields:
     extras: Sequence[_spec.ExtraRecord] = ()
     codebooks: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = field(default=())
+    antialiasing: int = _spec.ANTIALIASING_NONE
+    colour_space: int = _spec.COLOUR_SPACE_SRGB_REC709_DISPLAY
+    projection: int = _spec.PROJECTION_PERSPECTIVE
 
 
 @dataclass(frozen=True)
@@ -273,7 +276,7 @@ def _index(
         directory_size=_spec.DIRECTORY_RECORD_SIZE,
         tile_size=_spec.TILE_RECORD_SIZE,
         layer_size=_spec.LAYER_RECORD_SIZE,
-        reserved_0=0,
+        kernel=_spec.KERNEL_ELLIPSE,
         splat_count=sum(tile.splat_count for tile in tiles if tile.level == 0),
         tile_count=len(tiles),
         directory_count=len(directory),
@@ -285,6 +288,10 @@ def _index(
         axes=scene.axes,
         unit_metres=scene.unit_metres,
         origin=scene.origin,
+        projection=scene.projection,
+        antialiasing=scene.antialiasing,
+        colour_space=scene.colour_space,
+        reserved_0=0,
     )
     parts = [_spec.pack_index_head(head)]
     parts += [_spec.pack_attribute_record(record) for record in scene.attributes]

@@ -56,7 +56,7 @@ from csplat.encoder.target import SearchReport
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
-from csplat.scene_metadata import UNSPECIFIED
+from csplat.scene_metadata import COLOUR_SPACES, UNSPECIFIED
 from csplat.types import F32, Progress, null_progress
 
 Integers = NDArray[Any]
@@ -495,15 +495,15 @@ def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[Fi
     metadata, parameters = plan.model.metadata, plan.parameters
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if metadata.coordinate_system == UNSPECIFIED else tuple(metadata.coordinate_system)
-    flags = _spec.SCENE_FLAG_ANTIALIASED if metadata.antialiased else 0
-    flags |= _spec.SCENE_FLAG_FLAT if metadata.flat else 0
     return SceneFields(
         sh_degree=parameters.sh_degree,
-        scene_flags=flags,
+        scene_flags=_spec.SCENE_FLAG_FLAT if metadata.flat else 0,
         axes=bytes(directions[letter] for letter in letters),
         unit_metres=metadata.unit_metres or 0.0,
         origin=plan.model.origin,
         attributes=parameters.attribute_records(),
+        antialiasing=_spec.ANTIALIASING_MIP if metadata.antialiased else _spec.ANTIALIASING_NONE,
+        colour_space=COLOUR_SPACES[metadata.colour_space],
         extras=plan.extras,
         codebooks=codebooks.records,
         chunks=[*chunks, *codebooks.chunks],

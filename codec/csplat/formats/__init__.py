@@ -409,7 +409,9 @@ _PLY_FORMAT = Format(
     degree=MAX_SH_DEGREE,
     splat_bytes=(68.0, 104.0, 164.0, 248.0, 356.0),
     exact=frozenset(ARRAYS),
-    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
+    carries=frozenset(
+        {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "extra", "metadata"}
+    ),
 )
 _CSPLAT_FORMAT = Format(
     name=_CSPLAT,

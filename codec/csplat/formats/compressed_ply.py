@@ -360,5 +360,7 @@ FORMAT = Format(
     splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,
     ranges={"scales": ValueRange(-_LARGEST_LOG, _LARGEST_LOG), "shN": ValueRange(-4.0, 4.0, 1 / 32)},
-    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
+    carries=frozenset(
+        {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "metadata"}
+    ),
 )

@@ -12,7 +12,7 @@ from typing import Any
 from csplat.detect import KINDS
 from csplat.lint import Finding
 from csplat.scene import Scene
-from csplat.scene_metadata import UNSPECIFIED
+from csplat.scene_metadata import SRGB, UNSPECIFIED
 
 #: Splat attributes common to all formats.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -70,7 +70,7 @@ class Format:
         exact: names of the arrays that are stored losslessly; opacities stored as logits come back within an ulp.
         splat_bytes: approximate bytes per splat by SH degree, from 0 to `degree`; empty if that depends on the scene.
         carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
-            `flat` and `cameras` that the format stores.
+            `flat`, `colour_space` and `cameras` that the format stores.
     """
 
     name: str
@@ -124,6 +124,7 @@ _PARTS: dict[str, tuple[str, Callable[[Scene], Any]]] = {
     "coordinate_system": ("the axes", lambda scene: scene.metadata.coordinate_system != UNSPECIFIED),
     "unit_metres": ("the length of a unit", lambda scene: scene.metadata.unit_metres is not None),
     "flat": ("that splats are discs", lambda scene: scene.metadata.flat),
+    "colour_space": ("the colour space", lambda scene: scene.metadata.colour_space != SRGB),
     "cameras": ("cameras", lambda scene: scene.metadata.cameras),
     "metadata": ("metadata", lambda scene: scene.metadata.entries),
     "extra": ("extra columns", lambda scene: scene.extra),

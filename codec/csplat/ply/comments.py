@@ -7,6 +7,7 @@
 | `csplat absolute_origin X Y Z` | x, y, z are absolute, in doubles |
 | `csplat coordinate_system RDF` | directions of the axes |
 | `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SceneMetadata` |
+| `csplat colour_space NAME` | as in `SceneMetadata`; absent for sRGB |
 | `csplat training {JSON}`, `csplat view {JSON}` | the training (`TrainingRecord`) and the initial view |
 | `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
 """
@@ -26,7 +27,17 @@ from numpy.typing import NDArray
 from csplat.disk_files import parse_json
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat.scene_metadata import LICENCE, TRAINING, UNSPECIFIED, UP, VIEW, SceneMetadata, TrainingRecord, unit_up
+from csplat.scene_metadata import (
+    LICENCE,
+    SRGB,
+    TRAINING,
+    UNSPECIFIED,
+    UP,
+    VIEW,
+    SceneMetadata,
+    TrainingRecord,
+    unit_up,
+)
 from csplat.types import F32, F64
 
 _PREFIX = "csplat"
@@ -118,6 +129,8 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
         lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in metadata.stated_up)}")
     if metadata.unit_metres is not None:
         lines.append(f"{_PREFIX} unit_metres {metadata.unit_metres!r}")
+    if metadata.colour_space != SRGB:
+        lines.append(f"{_PREFIX} colour_space {metadata.colour_space}")
     if metadata.flat:
         lines.append("SplatRenderMode: 2dgs")
     if metadata.antialiased:
@@ -190,7 +203,7 @@ def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values
     """Set the field or entry of a csplat comment; return False if its key or its number of values is unknown."""
     if key in ("origin", "absolute_origin"):
         fields |= {"origin": tuple(_parse_numbers(key, values, 3)), "origin_is_added": key == "absolute_origin"}
-    elif key == "coordinate_system" and len(values) == 1:
+    elif key in ("coordinate_system", "colour_space") and len(values) == 1:
         fields[key] = values[0]
     elif key == UP:
         entries[UP] = _parse_up(values)

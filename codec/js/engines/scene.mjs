@@ -2,6 +2,7 @@
 // A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';
+import { drawnOtherwise } from '../registry.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
 import { onceSaid, uprightIn } from './packed_values.mjs';
@@ -56,6 +57,8 @@ export async function openScene(from, options, target, signals = []) {
     const degree = Math.min(wanted, target.shDegree);
     if (degree < wanted)
       onceSaid(target.name, `SH bands above ${degree} are left out: the engine ends at degree ${degree}`);
+    const otherwise = drawnOtherwise(reader.header);
+    if (otherwise) onceSaid(target.name, otherwise);
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
     return new SplatScene(

@@ -6,6 +6,7 @@ import { test } from 'node:test';
 import { CRC_SIZE, crc32 } from '../checksums.mjs';
 import { tableBytes } from '../codebooks.mjs';
 import { CsplatReader, LimitError, decode, readHeader } from '../decoder.mjs';
+import { drawnOtherwise } from '../registry.mjs';
 import { HEADER_OFFSETS, HEADER_SIZE } from '../spec.mjs';
 import { forged, hash, manifest, refusal, serve, vector } from './helpers.mjs';
 
@@ -126,6 +127,23 @@ test('files of other versions are refused by name', async () => {
     const error = await refusal(() => readHeader(vector(`invalid/header_version_minor_${name}`)));
     assert.ok(error.message.endsWith(`has version ${version}, this decoder reads 0.4`));
   }
+});
+
+test('other kernels are refused by name, other ways of drawing are returned', async () => {
+  for (const [id, name] of [...['SURFEL', 'BETA', 'TRIANGLE'].entries(), [3, '4']]) {
+    const error = await refusal(() => readHeader(vector(`invalid/index_head_kernel_is_${id + 1}`)));
+    assert.ok(error.message.endsWith(`kernel ${name} is not supported`));
+  }
+  assert.equal(drawnOtherwise(readHeader(rich)), '');
+  const { projection, antialiasing, colourSpace } = readHeader(vector('valid/ancillary_hints'));
+  assert.deepEqual([projection, antialiasing, colourSpace], [128, 128, 128]);
+  const known = readHeader(vector('valid/scene_facts'));
+  assert.equal(known.antialiased, true);
+  assert.equal(drawnOtherwise(known), 'colours of lin_rec709_display are drawn as sRGB');
+  assert.equal(
+    drawnOtherwise(readHeader(vector('valid/ancillary_hints_private'))),
+    'the projection 255 is drawn in perspective, colours of 255 are drawn as sRGB',
+  );
 });
 
 test('tiles are returned in the requested order', async () => {

@@ -15,7 +15,7 @@ from csplat.decoder import DecodedScene, decode_scene
 from csplat.disk_files import read_array
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel
-from csplat.scene_metadata import UNSPECIFIED
+from csplat.scene_metadata import SRGB, UNSPECIFIED
 from csplat.types import F64, I64
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.declared_bounds import Source, check_source_index, find_wrong_extras
@@ -131,6 +131,7 @@ def _find_guessed_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
         "unit_metres": (decoded.metadata.unit_metres, None),
         "antialiased": (decoded.metadata.antialiased, False),
         "flat": (decoded.metadata.flat, False),
+        "colour_space": (decoded.metadata.colour_space, SRGB),
     }
     wrong = [
         ("SRC-3", f"{name} is {value}, but the source does not specify it")

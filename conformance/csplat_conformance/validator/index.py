@@ -128,7 +128,7 @@ def _count_fitting_records(index: Index, at: int, end: int, count: int, size: in
 
 
 def _check_head(log: ViolationLog, head: Head) -> None:
-    """Check the index head: RES-1, IDX-3 to IDX-6, IDX-8."""
+    """Check the index head: RES-1, RES-2, IDX-3 to IDX-6, IDX-8."""
     record = head.record
     log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
@@ -137,6 +137,13 @@ def _check_head(log: ViolationLog, head: Head) -> None:
             log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
         log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
+    if record.kernel not in _spec.KERNEL_NAMES:
+        kernel = _spec.KERNEL_RESERVED.get(record.kernel, str(record.kernel)).upper()
+        log.add_field("RES-2", head, "kernel", f"{kernel} is not a kernel of this version")
+    for key, known in (("projection", (0,)), ("antialiasing", (0, 1)), ("colour_space", (0, 1))):
+        value = getattr(record, key)
+        if value not in known and value < _spec.ANCILLARY_ID_MIN:
+            log.add_field("RES-2", head, key, f"{value} is not in the registry")
     unlisted = record.scene_flags & _REGISTERED_SCENE_FLAGS & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")

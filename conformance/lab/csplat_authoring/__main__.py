@@ -132,8 +132,8 @@ def _pictures(recipe: Recipe, renders: bool) -> dict[Path, bytes]:
         old = path.read_bytes() if path.exists() else b""
         if (renders or not old) and recipe.scene is not None:
             made = expected(recipe.scene, 0)
-            flags = made.header["scene_flags"]
-            picture = reference_render(made.floats, view.camera, "antialiased" in flags)
+            antialiased = made.header["antialiasing"] == _spec.ANTIALIASING_MIP
+            picture = reference_render(made.floats, view.camera, antialiased)
             if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:
                 old = write_png(picture)
         if not old:

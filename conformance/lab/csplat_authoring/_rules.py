@@ -50,7 +50,7 @@ class Mask(NamedTuple):
 RANGES: Final[tuple[Range, ...]] = (
     Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
     Range("header", "version_minor", "", 4, 4, "HDR-2", "E_VERSION"),
-    Range("index_head", "head_size", "", 64, 255, "IDX-8", "E_VALUE"),
+    Range("index_head", "head_size", "", 68, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "attribute_size", "", 16, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "codebook_size", "", 12, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "extra_size", "", 64, 255, "IDX-8", "E_VALUE"),
@@ -98,7 +98,11 @@ RANGES: Final[tuple[Range, ...]] = (
 CHOICES: Final[tuple[Choice, ...]] = (
     Choice("header", "profile", "", (0,), (1, 2), "HDR-4", "E_UNSUPPORTED"),
     Choice("header", "resource_level", "", (1, 2, 3), (0, 4), "RES-2", "E_UNSUPPORTED"),
+    Choice("index_head", "kernel", "", (0,), (1, 2, 3, 4), "RES-2", "E_UNSUPPORTED"),
     Choice("index_head", "axes", "", (0, 1, 2, 3, 4, 5, 6), (7,), "IDX-4", "E_VALUE"),
+    Choice("index_head", "projection", "", (0,), (1,), "RES-2", "E_UNSUPPORTED"),
+    Choice("index_head", "antialiasing", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
+    Choice("index_head", "colour_space", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
     Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
     Choice("codebook_record", "kind", "", (4, 6), (3, 5), "RES-2", "E_UNSUPPORTED"),
     Choice("extra_record", "dtype", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "RES-2", "E_UNSUPPORTED"),
@@ -111,8 +115,8 @@ CHOICES: Final[tuple[Choice, ...]] = (
 
 MASKS: Final[tuple[Mask, ...]] = (
     Mask("header", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
+    Mask("index_head", "scene_flags", "", 242, 8, "RES-1", "E_RESERVED"),
     Mask("index_head", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
-    Mask("index_head", "scene_flags", "", 243, 8, "RES-1", "E_RESERVED"),
     Mask("attribute_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("codebook_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
     Mask("codebook_record", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),

@@ -131,7 +131,8 @@ def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> 
     counts = [len(directory), len(scene.codebooks), len(scene.extras), len(scene.attributes)]
     splats = sum(tile.splat_count for tile in scene.finest.tiles)
     facts: list[Any] = [scene.sh_degree, scene.scene_flags, bytes(scene.axes), scene.unit_metres, scene.origin]
-    out.structure("index", "index_head", [*sizes, 0, splats, len(scene.tiles), *counts, *facts])
+    facts += [scene.projection, scene.antialiasing, scene.colour_space, 0]
+    out.structure("index", "index_head", [*sizes, scene.kernel, splats, len(scene.tiles), *counts, *facts])
     for attribute, record in scene.attributes.items():
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         facts = [attribute, record.mapping, record.chroma_shift, 0, record.levels, record.step]

@@ -72,6 +72,10 @@ def _header(scene: Scene, index_size: int) -> dict[str, Any]:
         "axes": "".join(_spec.DIRECTION_LETTER[axis] for axis in scene.axes),
         "unit_metres": scene.unit_metres or 0.0,  # 0 of either sign is 0
         "origin": list(scene.origin),
+        "kernel": _spec.KERNEL_NAMES[scene.kernel],
+        "projection": scene.projection,
+        "antialiasing": scene.antialiasing,
+        "colour_space": scene.colour_space,
     }
 
 

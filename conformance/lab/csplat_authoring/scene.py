@@ -228,6 +228,10 @@ class Scene:
     trailing: bytes = b""
     tails: tuple[tuple[str, bytes], ...] = ()
     resource_level: int | None = None
+    kernel: int = _spec.KERNEL_ELLIPSE
+    projection: int = _spec.PROJECTION_PERSPECTIVE
+    antialiasing: int = _spec.ANTIALIASING_NONE
+    colour_space: int = _spec.COLOUR_SPACE_SRGB_REC709_DISPLAY
 
     @property
     def finest(self) -> Scene:

@@ -278,6 +278,15 @@ def test_errors_of_version_and_crc_name_the_stored_and_expected_values():
     assert f"E_CRC at byte 28 (HDR-3): found {stored:#010x}, computed {computed:#010x}" == str(refusal(data))
 
 
+def test_reserved_kernels_and_profiles_are_refused_by_name():
+    for field, value, name in (
+        ("index.kernel", _spec.KERNEL_SURFEL, "kernel SURFEL"), ("index.kernel", _spec.KERNEL_BETA, "kernel BETA"),
+        ("index.kernel", _spec.KERNEL_TRIANGLE, "kernel TRIANGLE"), ("index.kernel", 240, "kernel 240"),
+        ("header.profile", _spec.PROFILE_ARCHIVE, "profile ARCHIVE"), ("header.profile", 255, "profile 255"),
+    ):  # fmt: skip
+        assert str(refusal(BUILT.patched({field: value}))).endswith(f"{name} is not supported")
+
+
 def test_huge_counts_in_a_small_index_cost_nothing():
     sizes = {"tile": 2**32 - 1, "directory": 65535, "codebook": 65535, "extra": 65535, "attribute": 255}
     for name, size in sizes.items():

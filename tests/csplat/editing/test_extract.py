@@ -39,6 +39,17 @@ def data(sample):
     return encode(sample, EncodeOptions(tile_splats=120))
 
 
+def test_a_part_and_a_whole_keep_ways_of_drawing_that_are_unknown():
+    data = (VECTORS / "ancillary_hints_private.csplat").read_bytes()
+    _, part = extract(data, ALL)
+    _, whole = merge(part, data)
+    for one in (data, part, whole):
+        header = read_header(one)
+        assert (255, 192, 255, False) == (
+            header.projection, header.antialiasing, header.colour_space, header.antialiased
+        )  # fmt: skip
+
+
 @pytest.mark.slow
 def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     header = read_header(data)
@@ -283,4 +294,5 @@ CONTRADICTIONS = [
     (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
     (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
     (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
+    (({"colour_space": "130"}, {}), "colour spaces cannot be merged: 130 in .*a, 0 in .*b"),
 ]

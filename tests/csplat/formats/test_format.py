@@ -54,11 +54,13 @@ def test_formats_are_recognised_by_content_first(tmp_path, make_model):
 
 
 def test_losses_of_a_format_are_reported(make_model):
-    model = make_model(10, 2, antialiased=True, origin=(1.0, 2.0, 3.0), entries={"licence": "CC0"})
+    facts = {"antialiased": True, "colour_space": "lin_rec709_display", "entries": {"licence": "CC0"}}
+    model = make_model(10, 2, **facts, origin=(1.0, 2.0, 3.0))
     (ply,) = (one for one in formats() if one.name == "ply")
     assert () == ply.losses(Scene.of(model))
     bare = type(ply)("splat", degree=0)
-    assert ("SH bands 1 and 2", "that it is antialiased", "the origin", "metadata") == bare.losses(Scene.of(model))
+    lost = ("SH bands 1 and 2", "that it is antialiased", "the origin", "the colour space", "metadata")
+    assert lost == bare.losses(Scene.of(model))
 
 
 @pytest.mark.parametrize(("name", "data", "message"), [

@@ -156,6 +156,15 @@ def test_nodes_that_are_shown_are_read_whatever_the_file_requires():
     assert [2, 0] == read(said, data).means[:, 0].tolist()
 
 
+def test_linear_colours_are_written_as_such_and_read_as_srgb(tmp_path, make_model):
+    for space, written in (("lin_rec709_display", "lin_rec709_display"), ("130", "srgb_rec709_display")):
+        csplat.write(tmp_path / "a.glb", make_model(9, 0, colour_space=space))
+        assert f'"colorSpace":"{written}"'.encode() in (tmp_path / "a.glb").read_bytes().replace(b'": "', b'":"')
+        with csplat.open(tmp_path / "a.glb") as scene:
+            assert scene.metadata.colour_space == ("130" if space == "130" else "srgb_rec709_display")
+            assert ("linear-colours" in {finding.id for finding in scene.findings}) == (space != "130")
+
+
 def test_a_written_scene_reads_back(tmp_path, make_model):
     path, origin = tmp_path / "a.glb", (1.5, -2.0, 0.1)
     for degree in (0, 3):

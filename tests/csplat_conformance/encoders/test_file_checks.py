@@ -59,6 +59,7 @@ def test_splats_without_a_near_source_are_named(plain):
     ({"coordinate_system": "RDF"}, "axes is RDF"),
     ({"unit_metres": 1.0}, "unit_metres is 1.0"),
     ({"antialiased": True}, "antialiased is True"),
+    ({"colour_space": "lin_rec709_display"}, "colour_space is lin_rec709_display"),
     ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
 ])  # fmt: skip
 def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):

@@ -19,8 +19,8 @@ UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which
 #: Clauses of sections 2 to 8 that do not constrain the bytes of a file but decoders, readers of parts and editors, or
 #: that are permissions; CBK-6 and CBK-7 only delimit other clauses.
 NOT_ABOUT_FILES = {
-    "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5",
-    "CHK-6", "CHK-7", "CHK-8", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
+    "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "ANC-4", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2",
+    "CHK-5", "CHK-6", "CHK-7", "CHK-8", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
     "TRE-9", "LIM-2",
 }  # fmt: skip
 

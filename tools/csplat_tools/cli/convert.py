@@ -60,7 +60,7 @@ def convert(
     lod-meta.json gets streamed SOG, with all levels of detail.
 
     Formats, their highest SH degree, and what else they hold (header: axes,
-    origin, unit, metadata, antialiased, flat):
+    origin, unit, metadata, antialiased, flat, colour space):
       ply             .ply             read, write  4  header, extra
       compressed-ply  .compressed.ply  read, write  3  header
       csplat          .csplat          read, write  4  header, extra, cameras

@@ -30,7 +30,7 @@ from csplat.disk_files import finite_or_none, size_on_disk
 from csplat.errors import FormatError
 from csplat.formats import format_by_name
 from csplat.scene import Scene
-from csplat.scene_metadata import TRAINING, UP, VIEW, SceneMetadata
+from csplat.scene_metadata import SRGB, TRAINING, UP, VIEW, SceneMetadata
 from csplat_tools.console import format_bytes
 from csplat_tools.scene_files import findings_as_json
 
@@ -188,6 +188,10 @@ class FileDescription:
             "up": None if up is None else list(up),
             "unit_metres": header.unit_metres,
             "origin": list(header.origin),
+            "kernel": header.kernel,
+            "projection": _spec.PROJECTION_NAMES.get(header.projection, header.projection),
+            "antialiasing": _spec.ANTIALIASING_NAMES.get(header.antialiasing, header.antialiasing),
+            "colour_space": metadata.colour_space,
             "antialiased": header.antialiased,
             "flat": header.flat,
             "attributes": {
@@ -361,6 +365,7 @@ def describe_placement(scene: SceneHeader | Scene, count: int, metadata: SceneMe
         metadata: metadata of the scene.
     """
     flags = [name for name in ("antialiased", "flat") if getattr(metadata, name)]
+    flags += [f"colour space {metadata.colour_space}"] * (metadata.colour_space != SRGB)
     up, unit = metadata.up, metadata.unit_metres
     return {
         "splats": f"{count:,}, SH degree {scene.sh_degree}",

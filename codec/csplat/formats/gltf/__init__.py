@@ -21,5 +21,7 @@ FORMAT = Format(
     ranges={"scales": ValueRange(LOG_OF_0, LOG_OF_LARGEST)},
     exact=frozenset({"means", "quats", "opacities", "sh0", "shN"}),
     splat_bytes=(60.0, 96.0, 156.0, 240.0),
-    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
+    carries=frozenset(
+        {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "metadata"}
+    ),
 )

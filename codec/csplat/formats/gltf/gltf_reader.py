@@ -36,15 +36,13 @@ from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene import BLOCK_SPLATS, Scene
-from csplat.scene_metadata import LICENCE, SceneMetadata
+from csplat.scene_metadata import LICENCE, LINEAR, SRGB, SceneMetadata
 from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat.types import F32, F64
 
 #: Directions of +x, +y and +z: left, up, front.
 AXES = "LUF"
 EXTENSION = "KHR_gaussian_splatting"
-COLOURS = "srgb_rec709_display"
-_LINEAR = "lin_rec709_display"
 #: Names of the extension that packs splats as SPZ, and of its predecessors.
 _SPZ = (
     "KHR_gaussian_splatting_compression_spz_2",
@@ -137,7 +135,7 @@ class _GltfReading:
             bad = infinite = 0
         else:
             block, count, (bad, infinite) = self._plain_block(placed)
-        if extension.get("colorSpace") == _LINEAR:
+        if extension.get("colorSpace") == LINEAR:
             self.linear_samples.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
             block = partial(_decode_in_srgb, block)
         for matrix in self.file.instances(placed):
@@ -167,7 +165,7 @@ class _GltfReading:
     def _check(self, placed: PlacedPrimitive, extension: dict[str, Any], json_path: JsonPath, *, packed: bool) -> None:
         """Refuse unknown kernels, colour spaces and projections; drafts with SPZ may omit them."""
         absent = {None} if packed else set()
-        known = {"kernel": {"ellipse"} | absent, "colorSpace": {COLOURS, _LINEAR} | absent}
+        known = {"kernel": {"ellipse"} | absent, "colorSpace": {SRGB, LINEAR} | absent}
         attributes = self.file.get(placed.primitive, placed.json_path, "attributes", dict, {})
         if not packed and "kernel" not in extension and f"{EXTENSION}:OPACITY" not in attributes:
             draft = f"an early draft of {EXTENSION} (2025) without kernel and with opacities in COLOR_0"
@@ -334,6 +332,8 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         empty = _pad_bands(instances[0].decode(slice(0, 0)), degree)
         antialiased = comments.metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
         metadata = replace(comments.metadata, coordinate_system=AXES, antialiased=antialiased)
+        if metadata.colour_space == LINEAR:
+            metadata = replace(metadata, colour_space=SRGB)  # `_decode_in_srgb`
         empty = replace(empty, origin=(x, y, z), metadata=metadata)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
@@ -384,7 +384,7 @@ def _conclude(reading: _GltfReading) -> None:
             )
         except InputError as failure:
             raise InputError(f"{reading.file.path.name}: {failure}") from None
-        text = f"colours are linear ({_LINEAR}): fitted to sRGB, rms error {error:.2f} of 255 steps"
+        text = f"colours are linear ({LINEAR}): fitted to sRGB, rms error {error:.2f} of 255 steps"
         text += "; overlapping splats blend in linear light there, and in sRGB here"
         reading.findings.append(Finding("linear-colours", reading.count, text, "repair"))
 

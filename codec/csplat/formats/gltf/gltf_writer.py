@@ -17,10 +17,11 @@ from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes, scale_scene
 from csplat.errors import InputError
 from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
-from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
+from csplat.formats.gltf.gltf_reader import AXES, EXTENSION, sh_names
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments
 from csplat.scene import Scene
+from csplat.scene_metadata import LINEAR, SRGB
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -83,8 +84,10 @@ def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
     """Compute linear RGB and alpha [N, 4] for programs that only draw points."""
-    srgb = np.clip(model.sh0 * np.float32(SH_C0) + np.float32(0.5), 0.0, 1.0)
-    linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    colours = np.clip(model.sh0 * np.float32(SH_C0) + np.float32(0.5), 0.0, 1.0)
+    linear: F32 = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    if model.metadata.colour_space == LINEAR:
+        linear = colours
     return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)
 
 
@@ -112,7 +115,8 @@ def _build_json(
         accessors[index] |= {} if is_float else {"normalized": True}
     accessors[0] |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
     names = [name if name in ("POSITION", "COLOR_0") else f"{EXTENSION}:{name}" for name in attributes]
-    splats = {"kernel": "ellipse", "colorSpace": COLOURS}
+    space = scene.metadata.colour_space
+    splats = {"kernel": "ellipse", "colorSpace": space if space in (SRGB, LINEAR) else SRGB}
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},
         "mode": 0,

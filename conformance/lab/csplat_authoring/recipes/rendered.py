@@ -70,7 +70,7 @@ def _antialiased() -> Recipe:
     return _recipe(
         "antialiased",
         "splats smaller than a pixel, with the low-pass filter's loss made good; off the middle of the picture",
-        replace(made, scene_flags=_spec.SCENE_FLAG_ANTIALIASED),
+        replace(made, antialiasing=_spec.ANTIALIASING_MIP),
         [
             _camera((1.5, 2.0, -3.4), (0.0, 0.0, 0.0), focal=170.0),
             _camera((0.0, -0.4, 2.6), (0.3, 0.3, 0.0), centre=(40.0, 80.0)),
