@@ -300,7 +300,10 @@ def rules_module(registry: Registry) -> str:
             low, high = rule["range"]
             ranges.append(f"Range({where}, {low!r}, {high!r}, {refusal})")
         elif "enum" in rule:
-            used, others = ids_of(enum_named(registry, rule["enum"]))
+            enum = enum_named(registry, rule["enum"])
+            used, others = ids_of(enum)
+            if enum.get("private") == "critical":
+                others += [constant_named(registry, "private_id_min"), 2 ** bits_of(base) - 1]
             choices.append(f"Choice({where}, {tuple(used)}, {tuple(others)}, {refusal})")
         else:
             listed = sum(ids_of(enum_named(registry, rule["flags"]))[0]) if rule["flags"] else 0
@@ -360,6 +363,11 @@ def enum_named(registry: Registry, name: str) -> Registry:
             found: Registry = enum
             return found
     raise SystemExit(f"registry: no enum {name}")
+
+
+def constant_named(registry: Registry, name: str) -> int:
+    """Return the value of a constant by name."""
+    return next(int(constant["value"]) for constant in registry["constant"] if constant["name"] == name)
 
 
 def ids_of(enum: Registry) -> tuple[list[int], list[int]]:

@@ -31,6 +31,8 @@ JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at
 EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
 NO_PARENT: Final = 4294967295  # `parent` of a node that has none, 2^32 − 1
 ANCILLARY_ID_MIN: Final = 128  # least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
+PRIVATE_ID_MIN: Final = 240  # least private id of what a decoder must know (12)
+PRIVATE_ANCILLARY_ID_MIN: Final = 192  # least private id of what a decoder need not know (12)
 ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
@@ -200,6 +202,17 @@ CHUNK_DECLARED_ERRORS: Final = b"SERR"
 CHUNK_TREE: Final = b"TREE"
 CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "declared_errors", b"TREE": "tree"}
 CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CODB": ("critical",), b"META": ("safe_to_copy",), b"CAMS": ("safe_to_copy",), b"OPTS": (), b"SERR": (), b"TREE": ("critical",)}
+
+# Keys of META
+META_KEY_TITLE: Final = "title"
+META_KEY_LICENCE: Final = "licence"
+META_KEY_SOURCE: Final = "source"
+META_KEY_COMMENTS: Final = "comments"
+META_KEY_TRAINING: Final = "training"
+META_KEY_UP: Final = "up"
+META_KEY_VIEW: Final = "view"
+META_KEY_ESTIMATED: Final = "estimated"
+META_KEY_NAMES: Final[dict[str, str]] = {"title": "title", "licence": "licence", "source": "source", "comments": "comments", "training": "training", "up": "up", "view": "view", "estimated": "estimated"}
 
 # Error codes
 ERROR_MAGIC: Final = "E_MAGIC"

@@ -24,11 +24,12 @@ SRGB = _spec.COLOUR_SPACE_NAMES[_spec.COLOUR_SPACE_SRGB_REC709_DISPLAY]
 LINEAR = _spec.COLOUR_SPACE_NAMES[_spec.COLOUR_SPACE_LIN_REC709_DISPLAY]
 
 #: Keys of entries.
-COMMENTS = "comments"
-LICENCE = "licence"
-TRAINING = "training"
-UP = "up"
-VIEW = "view"
+COMMENTS = _spec.META_KEY_COMMENTS
+ESTIMATED = _spec.META_KEY_ESTIMATED
+LICENCE = _spec.META_KEY_LICENCE
+TRAINING = _spec.META_KEY_TRAINING
+UP = _spec.META_KEY_UP
+VIEW = _spec.META_KEY_VIEW
 
 #: Cosine of the angle between up directions that contradict each other; at larger angles another axis is closer to up.
 CONTRADICTS = math.cos(math.radians(45.0))
@@ -55,7 +56,8 @@ class SceneMetadata:
         cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
             pixel centres are at +0.5. `None` if there are none.
         entries: JSON-compatible. Keys in use: `licence` (str), `comments` (list of str), `training` (a
-            `TrainingRecord`), `up` (three numbers), `view` (initial camera of a viewer, in the form of `cameras`).
+            `TrainingRecord`), `up` (three numbers), `view` (initial camera of a viewer, in the form of `cameras`, and
+            `from`: `training`, `estimate` or `author`), `estimated` (list of the keys whose values are estimates).
             Properties return their values if these are valid.
 
     Raises:
@@ -94,6 +96,12 @@ class SceneMetadata:
         return self.stated_up or up_of_axes(self.coordinate_system)
 
     @property
+    def estimated(self) -> list[str]:
+        """Keys of the entries that are estimates."""
+        keys = self.entries.get(ESTIMATED)
+        return [key for key in keys if isinstance(key, str)] if isinstance(keys, list) else []
+
+    @property
     def training(self) -> TrainingRecord | None:
         """Training record; `None` if absent or invalid."""
         try:
@@ -118,13 +126,16 @@ class SceneMetadata:
         merged = {**self.entries, **entries}
         return replace(self, entries={key: value for key, value in merged.items() if entries.get(key, key) is not None})
 
-    def with_up(self, up: Direction | None = None, coordinate_system: str | None = None) -> SceneMetadata:
+    def with_up(
+        self, up: Direction | None = None, coordinate_system: str | None = None, *, estimated: bool = False
+    ) -> SceneMetadata:
         """Return the metadata with another up direction or other axes; entries that contradict them are removed.
 
         Args:
             up: three finite numbers, not all 0; `None`: unchanged. Without `coordinate_system`, existing axes with a
                 different up are removed.
             coordinate_system: as above; `None`: unchanged. Without `up`, an existing up direction is removed.
+            estimated: `up` is an estimate.
 
         Examples:
             >>> import csplat
@@ -137,6 +148,9 @@ class SceneMetadata:
         if up is None and coordinate_system is None:
             return self
         entries = dict(self.entries)
+        estimates = [key for key in self.estimated if key != UP] + [UP] * (estimated and up is not None)
+        entries.pop(ESTIMATED, None)
+        entries |= {ESTIMATED: estimates} if estimates else {}
         letters = self.coordinate_system if coordinate_system is None else coordinate_system
         if coordinate_system is not None:
             entries.pop(UP, None)

@@ -23,6 +23,8 @@ export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are 
 export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
 export const NO_PARENT = 4294967295; // `parent` of a node that has none, 2^32 − 1
 export const ANCILLARY_ID_MIN = 128; // least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
+export const PRIVATE_ID_MIN = 240; // least private id of what a decoder must know (12)
+export const PRIVATE_ANCILLARY_ID_MIN = 192; // least private id of what a decoder need not know (12)
 export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
@@ -192,6 +194,17 @@ export const CHUNK_DECLARED_ERRORS = 'SERR';
 export const CHUNK_TREE = 'TREE';
 export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'declared_errors', 'TREE': 'tree' });
 export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 'CODB': Object.freeze(['critical']), 'META': Object.freeze(['safe_to_copy']), 'CAMS': Object.freeze(['safe_to_copy']), 'OPTS': Object.freeze([]), 'SERR': Object.freeze([]), 'TREE': Object.freeze(['critical']) });
+
+// Keys of META
+export const META_KEY_TITLE = 'title';
+export const META_KEY_LICENCE = 'licence';
+export const META_KEY_SOURCE = 'source';
+export const META_KEY_COMMENTS = 'comments';
+export const META_KEY_TRAINING = 'training';
+export const META_KEY_UP = 'up';
+export const META_KEY_VIEW = 'view';
+export const META_KEY_ESTIMATED = 'estimated';
+export const META_KEY_NAMES = Object.freeze({ 'title': 'title', 'licence': 'licence', 'source': 'source', 'comments': 'comments', 'training': 'training', 'up': 'up', 'view': 'view', 'estimated': 'estimated' });
 
 // Error codes
 export const ERROR_MAGIC = 'E_MAGIC';

@@ -109,3 +109,20 @@ def in_page(path, *words):
     settings = json.loads(re.search(r'id="csplat-page">(.*?)</script>', text, re.DOTALL)[1])
     scene = decode(base64.b64decode(re.search(r'id="csplat-scene">(.*?)</script>', text, re.DOTALL)[1]))
     return scene, settings["wishes"]
+
+
+def test_an_estimated_up_direction_is_marked_until_another_is_given():
+    estimated = SceneMetadata(entries={"estimated": ["view"]}).with_up((0, 0, 1), estimated=True)
+    assert ["view", "up"] == estimated.estimated
+    assert ["view"] == estimated.with_up((0, 1, 0)).estimated
+    assert ["view"] == estimated.with_up(coordinate_system="RDF").estimated
+    assert "estimated" not in SceneMetadata().with_up((0, 0, 1), estimated=True).with_up((0, 1, 0)).entries
+    assert [] == SceneMetadata(entries={"estimated": "up"}).estimated
+
+
+def test_a_colour_space_is_registered_or_the_number_of_an_unknown_one():
+    for space in ("srgb_rec709_display", "lin_rec709_display", "128", "255"):
+        assert space == SceneMetadata(colour_space=space).colour_space
+    for space in ("srgb", "127", "256", ""):
+        with pytest.raises(InputError, match="expected one of srgb_rec709_display"):
+            SceneMetadata(colour_space=space)

@@ -128,7 +128,10 @@ def test_the_first_view_of_surroundings_is_a_training_camera(data):
     far = rng.standard_normal((60, 3)) * 40.0
     points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
     given = DataSet("surrounded", data.train, data.test, points, np.full((260, 3), 0.5, np.float32))
-    view = Camera.from_json(train(given, brief(strategy="none", max_splats=260)).model.metadata.entries["view"])
+    given = replace(given, up=(0.0, 0.6, -0.8))
+    metadata = train(given, brief(strategy="none", max_splats=260)).model.metadata
+    view = Camera.from_json(metadata.entries["view"])
+    assert ("training", ["up"]) == (metadata.entries["view"]["from"], metadata.estimated)  # up by the cameras
     taken = [one.camera for one in data.train]
     assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)

@@ -33,7 +33,7 @@ export async function withUp(bytes, up) {
   );
   const before = directory.find(({ type }) => type === spec.CHUNK_METADATA);
   const flags = before?.flags ?? registeredFlags(spec.CHUNK_METADATA);
-  const meta = metadataChunk({ ...metadata, up }, flags);
+  const meta = metadataChunk(withoutEstimate({ ...metadata, up }), flags);
 
   const source = new Uint8Array(bytes);
   const index = source.slice(0, spec.HEADER_SIZE + header.indexSize - CRC_SIZE); // includes the header
@@ -82,6 +82,17 @@ export async function withUp(bytes, up) {
   const crcAt = spec.HEADER_SIZE + indexSize - CRC_SIZE;
   new DataView(written.buffer).setUint32(crcAt, crc32(written.subarray(spec.HEADER_SIZE, crcAt)), true);
   return written;
+}
+
+/**
+ * Return metadata whose up direction is no estimate.
+ *
+ * @param {Record<string, unknown>} metadata
+ */
+function withoutEstimate({ estimated, ...others }) {
+  if (!Array.isArray(estimated)) return estimated === undefined ? others : { ...others, estimated };
+  const keys = estimated.filter((key) => key !== spec.META_KEY_UP);
+  return keys.length ? { ...others, estimated: keys } : others;
 }
 
 /**

@@ -68,4 +68,4 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
 
 def with_estimated_up(model: SplatModel) -> SplatModel:
     """Return the scene for viewing, with the estimated up direction if it does not specify its own."""
-    return model.with_metadata(model.metadata.with_up(estimate_up(model)))
+    return model.with_metadata(model.metadata.with_up(estimate_up(model), estimated=True))

@@ -326,7 +326,9 @@ class _Training:
         entries = {TRAINING: self._data.trained_on(self._colour).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
             entries[VIEW] = _first_view([image.camera for image in self._data.train])
-        metadata = replace(model.metadata, entries=entries).with_up(self._data.up, self._data.coordinate_system)
+        metadata = replace(model.metadata, entries=entries).with_up(
+            self._data.up, self._data.coordinate_system, estimated=self._data.up_is_estimated
+        )
         return replace(model, metadata=metadata, origin=self._data.origin)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
@@ -397,13 +399,13 @@ def _expected_shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
 
 
 def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Return the central camera as an entry of CAMS (spec 5.4), to seven digits."""
+    """Return the central camera as the entry `view` (spec 5.4), to seven digits."""
     camera = central_camera(cameras)
     matrices = {
         name: [[float(f"{value:.7g}") for value in row] for row in matrix.tolist()]
         for name, matrix in (("K", camera.K), ("viewmat", camera.viewmat))
     }
-    return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}")}
+    return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}"), "from": "training"}
 
 
 def _load_lpips_weights(options: TrainOptions, outputs: Outputs) -> Lpips | None:

@@ -7,6 +7,7 @@
 | `csplat absolute_origin X Y Z` | x, y, z are absolute, in doubles |
 | `csplat coordinate_system RDF` | directions of the axes |
 | `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SceneMetadata` |
+| `csplat estimated KEY ...` | entries that are estimates: `up` |
 | `csplat colour_space NAME` | as in `SceneMetadata`; absent for sRGB |
 | `csplat training {JSON}`, `csplat view {JSON}` | the training (`TrainingRecord`) and the initial view |
 | `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
@@ -28,6 +29,7 @@ from csplat.disk_files import parse_json
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.scene_metadata import (
+    ESTIMATED,
     LICENCE,
     SRGB,
     TRAINING,
@@ -127,6 +129,8 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
         lines.append(f"{_PREFIX} coordinate_system {metadata.coordinate_system}")
     if metadata.stated_up is not None:
         lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in metadata.stated_up)}")
+    if metadata.estimated:
+        lines.append(f"{_PREFIX} {ESTIMATED} {' '.join(metadata.estimated)}")
     if metadata.unit_metres is not None:
         lines.append(f"{_PREFIX} unit_metres {metadata.unit_metres!r}")
     if metadata.colour_space != SRGB:
@@ -211,6 +215,8 @@ def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values
         (fields[key],) = _parse_numbers(key, values, 1)
     elif key in ("antialiased", "flat") and not values:
         fields[key] = True
+    elif key == ESTIMATED and values:
+        entries[ESTIMATED] = list(values)
     elif key == LICENCE and values:
         entries[LICENCE] = " ".join(values)
     else:

@@ -96,21 +96,21 @@ RANGES: Final[tuple[Range, ...]] = (
 )
 
 CHOICES: Final[tuple[Choice, ...]] = (
-    Choice("header", "profile", "", (0,), (1, 2), "HDR-4", "E_UNSUPPORTED"),
+    Choice("header", "profile", "", (0,), (1, 2, 240, 255), "HDR-4", "E_UNSUPPORTED"),
     Choice("header", "resource_level", "", (1, 2, 3), (0, 4), "RES-2", "E_UNSUPPORTED"),
-    Choice("index_head", "kernel", "", (0,), (1, 2, 3, 4), "RES-2", "E_UNSUPPORTED"),
+    Choice("index_head", "kernel", "", (0,), (1, 2, 3, 4, 240, 255), "RES-2", "E_UNSUPPORTED"),
     Choice("index_head", "axes", "", (0, 1, 2, 3, 4, 5, 6), (7,), "IDX-4", "E_VALUE"),
     Choice("index_head", "projection", "", (0,), (1,), "RES-2", "E_UNSUPPORTED"),
     Choice("index_head", "antialiasing", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
     Choice("index_head", "colour_space", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
-    Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
-    Choice("codebook_record", "kind", "", (4, 6), (3, 5), "RES-2", "E_UNSUPPORTED"),
+    Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5, 240, 255), "ATT-2", "E_VALUE"),
+    Choice("codebook_record", "kind", "", (4, 6), (3, 5, 240, 255), "RES-2", "E_UNSUPPORTED"),
     Choice("extra_record", "dtype", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "RES-2", "E_UNSUPPORTED"),
     Choice("layer_record", "layer", "", (0, 1, 2, 3, 4, 8), (5,), "RES-2", "E_UNSUPPORTED"),
-    Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "BLK-1", "E_UNSUPPORTED"),
-    Choice("stream_head", "coder", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
-    Choice("stream_head", "transforms", "", (0, 1, 2, 3, 4), (5,), "RES-2", "E_UNSUPPORTED"),
-    Choice("declared_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "SER-1", "E_VALUE"),
+    Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9, 240, 255), "BLK-1", "E_UNSUPPORTED"),
+    Choice("stream_head", "coder", "", (0, 1), (2, 240, 255), "RES-2", "E_UNSUPPORTED"),
+    Choice("stream_head", "transforms", "", (0, 1, 2, 3, 4), (5, 240, 255), "RES-2", "E_UNSUPPORTED"),
+    Choice("declared_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9, 240, 255), "SER-1", "E_VALUE"),
 )
 
 MASKS: Final[tuple[Mask, ...]] = (

@@ -35,8 +35,9 @@ def test_writes_the_columns_and_order_that_viewers_expect(tmp_path, make_model):
 
 
 def test_metadata_survive_a_ply_and_comments_of_other_programs_are_read(tmp_path, make_model):
+    entries = {"licence": "CC0-1.0", "comments": ["hello"], "up": [0, 0, 1], "estimated": ["up"]}
     model = make_model(4, origin=(4.5e6, -1.25, 0.1), coordinate_system="RUB", unit_metres=0.01, antialiased=True,
-        flat=True, colour_space="200", entries={"licence": "CC0-1.0", "comments": ["hello"]})  # fmt: skip
+        flat=True, colour_space="200", entries=entries)  # fmt: skip
     write_ply(tmp_path / "a.ply", model)
     again = read_ply(tmp_path / "a.ply", strict=True)
     for name in ("origin", "metadata"):

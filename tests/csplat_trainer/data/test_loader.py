@@ -448,6 +448,7 @@ def test_a_set_records_its_options(tmp_path):
         assert expected == {name: record[name] for name in record if name in expected or name != "near"}
         assert "near" in record
         assert ("RFU" if is_blender else "unspecified", (0, 0, 1)) == (data.coordinate_system, data.up)
+        assert data.up_is_estimated != is_blender
         assert any("up is 0 0 1 by the cameras" in line for line in data.report) != is_blender
 
 

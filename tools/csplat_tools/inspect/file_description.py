@@ -30,7 +30,7 @@ from csplat.disk_files import finite_or_none, size_on_disk
 from csplat.errors import FormatError
 from csplat.formats import format_by_name
 from csplat.scene import Scene
-from csplat.scene_metadata import SRGB, TRAINING, UP, VIEW, SceneMetadata
+from csplat.scene_metadata import ESTIMATED, SRGB, TRAINING, UP, VIEW, SceneMetadata
 from csplat_tools.console import format_bytes
 from csplat_tools.scene_files import findings_as_json
 
@@ -351,8 +351,10 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
         words["cameras"] = str(len(file.metadata.cameras))
     if file.metadata.training is not None:
         words["trained on"] = str(file.metadata.training)
-    if file.metadata.entries.get(VIEW) is not None:
-        words["first view"] = "a camera of the metadata"
+    view = file.metadata.entries.get(VIEW)
+    if view is not None:
+        source = view.get("from") if isinstance(view, dict) else None
+        words["first view"] = "a camera of the metadata" + (f" ({source})" if isinstance(source, str) else "")
     return words
 
 
@@ -367,10 +369,11 @@ def describe_placement(scene: SceneHeader | Scene, count: int, metadata: SceneMe
     flags = [name for name in ("antialiased", "flat") if getattr(metadata, name)]
     flags += [f"colour space {metadata.colour_space}"] * (metadata.colour_space != SRGB)
     up, unit = metadata.up, metadata.unit_metres
+    estimated = " (estimated)" if UP in metadata.estimated else ""
     return {
         "splats": f"{count:,}, SH degree {scene.sh_degree}",
         "axes": metadata.coordinate_system,
-        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
+        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up) + estimated,
         "unit": "unknown" if unit is None else f"{unit:g} m",
         "origin": " ".join(f"{value:.17g}" for value in scene.origin),
         "flags": ", ".join(flags) or "none",
@@ -400,6 +403,7 @@ def other_metadata(file: FileDescription) -> dict[str, object]:
     """Return the metadata that `describe_scene` does not describe."""
     metadata = file.metadata
     described = {VIEW: True, TRAINING: metadata.training is not None, UP: metadata.stated_up is not None}
+    described[ESTIMATED] = metadata.estimated == [UP]
     return {key: value for key, value in metadata.entries.items() if not described.get(key)}
 
 

@@ -16,7 +16,7 @@ from csplat.errors import InputError, counted
 from csplat.image_opener import open_image
 from csplat.lint import Finding
 from csplat.ply.ply_reader import parse_ply
-from csplat.scene_metadata import UNSPECIFIED, Direction, TrainingRecord
+from csplat.scene_metadata import UNSPECIFIED, Direction, TrainingRecord, up_of_axes
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
 from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name, printable
@@ -63,6 +63,11 @@ class DataSet:
     images: str | None = None
     val: list[PosedImage] = field(default_factory=list)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def up_is_estimated(self) -> bool:
+        """True if the cameras determine the up direction, and not the kind of set."""
+        return self.up is not None and self.up != up_of_axes(self.coordinate_system)
 
     @property
     def background(self) -> tuple[float, float, float]:
