@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import covariance_entries, mean_axes
+from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I64
 from csplat_render.neighbours import nearest_neighbours
@@ -43,7 +44,7 @@ def find_alike(splats: SplatModel) -> tuple[I64, F64]:
     edges = np.stack([first, near[first, k]])
     keys = np.unique(edges.min(axis=0) * len(splats) + edges.max(axis=0))  # each edge once
     edges = np.stack(np.divmod(keys, max(1, len(splats))))
-    largest = splats.scales.max(axis=1, initial=-np.inf).astype(np.float64)
+    largest = _limited(splats.scales).max(axis=1, initial=-np.inf)
     sizes = largest[edges]
     distances = np.linalg.norm(splats.means[edges[1]].astype(np.float64) - splats.means[edges[0]], axis=1)
     # Pairs that the exact mismatch would refuse; most are, so that the rest takes little time and memory.
@@ -61,7 +62,7 @@ def _mismatch(splats: SplatModel, edges: I64, largest: F64) -> F64:
     offsets = (splats.means[edges[1]].astype(np.float64) - splats.means[edges[0]]) * np.exp(-unit)[:, None]
     covariances, apart = [], np.zeros(edges.shape[1])
     for rows in edges:
-        variances = np.exp(2.0 * np.maximum(splats.scales[rows] - unit[:, None], -15.0))
+        variances = np.exp(2.0 * np.maximum(_limited(splats.scales[rows]) - unit[:, None], -15.0))
         covariances.append(covariance_entries(splats.quats[rows].T, variances.T))
         inverse = covariance_entries(splats.quats[rows].T, 1.0 / variances.T)
         squares = sum(
@@ -106,7 +107,7 @@ def average_pairs(splats: SplatModel, pairs: I64) -> dict[str, NDArray[np.floati
         return np.asarray(weights * first + (1.0 - weights) * second)
 
     offsets = (two[1].means.astype(np.float64) - two[0].means).T
-    own_covariances = [covariance_entries(part.quats.T, np.exp(2.0 * part.scales.astype(np.float64)).T) for part in two]
+    own_covariances = [covariance_entries(part.quats.T, np.exp(2.0 * _limited(part.scales)).T) for part in two]
     between = np.stack([offsets[i] * offsets[j] for i, j in _AXES]) * (share * (1.0 - share))  # covariance of centres
     covariances = averaged(own_covariances[0].T, own_covariances[1].T).T + between
     trace = np.maximum(covariances[:3].sum(axis=0), _TINY)
@@ -135,5 +136,10 @@ def light_of(splats: SplatModel) -> F64:
 
 def mean_areas(scales: F32) -> F64:
     """Return the areas [N] of projections of ellipsoids [N, 3], mean over directions, up to a factor (Knud Thomsen)."""
-    a, b, c = np.exp(scales.astype(np.float64)).T
+    a, b, c = np.exp(_limited(scales)).T
     return np.asarray((a * b + a * c + b * c) / 3.0)
+
+
+def _limited(scales: F32) -> F64:
+    """Return log standard deviations whose exponentials and squares are finite."""
+    return np.clip(scales.astype(np.float64), -SCALE_MOST, SCALE_MOST)
