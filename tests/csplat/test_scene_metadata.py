@@ -68,10 +68,13 @@ def without_up(**fields):
     return lambda _folder, make_model: make_model(60, 1, **fields)
 
 
+ESTIMATED = trained(write_colmap_set, (0, -1, 0))  # COLMAP sets do not state a direction
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("make", "words", "axes", "up"), [
     (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
-    (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
+    (ESTIMATED, [], "unspecified", (0, -1, 0)),
     (trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0)),
     (without_up(), [], "unspecified", None),
     (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
@@ -90,6 +93,7 @@ def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
     scene, wishes = in_page(path)
     assert (up, {}) == (scene.metadata.up, wishes)
     shown = "unknown" if up is None else " ".join(f"{value:g}" for value in up)
+    shown += r" \(estimated\)" if make is ESTIMATED else ""
     assert re.search(rf"\nup +{shown}\n", call("info", tmp_path / "b.csplat").stdout)
     model = read_ply(tmp_path / "b.ply")
     assert scene.metadata.with_entries(comments=None) == model.metadata.with_entries(comments=None)

@@ -21,6 +21,7 @@ from csplat_render.neighbours import nearest_neighbours
 _NEIGHBOURS = 4  # neighbours that a splat may be alike
 _MOST_APART = 1.0  # largest distance of centres in standard deviations, and largest factor e^x between sizes
 _AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # row and column of each entry of a covariance
+_MISMATCH_MAX = 1.0  # estimated error of merging above which removing a splat is better
 _OPACITY_MAX = 0.9999  # of merged splats
 _TINY = np.finfo(np.float64).tiny
 
@@ -51,7 +52,8 @@ def find_alike(splats: SplatModel) -> tuple[I64, F64]:
     is_near = np.log(np.maximum(distances, _TINY)) <= sizes.min(axis=0)
     edges = edges[:, is_near & (np.abs(sizes[0] - sizes[1]) <= _MOST_APART)]
     mismatch = _mismatch(splats, edges, largest)
-    edges, mismatch = edges[:, mismatch < 1.0], mismatch[mismatch < 1.0]
+    is_alike = mismatch < _MISMATCH_MAX
+    edges, mismatch = edges[:, is_alike], mismatch[is_alike]
     light = light_of(splats)[edges]
     return np.where(light[0] >= light[1], edges, edges[::-1]), mismatch
 

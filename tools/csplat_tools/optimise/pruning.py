@@ -96,10 +96,12 @@ class Pruner:
 
     @cached_property
     def order(self) -> PruningOrder:
-        """The pruning order."""
-        return PruningOrder(
-            self.source, [*self.measured], self.views.background, merges=self.refits, context=self.context
-        )
+        """The pruning order; copies of splats are merged."""
+        return self._new_order(merges=self.refits)
+
+    def _new_order(self, *, merges: bool) -> PruningOrder:
+        """Return the pruning order of the source."""
+        return PruningOrder(self.source, [*self.measured], self.views.background, merges=merges, context=self.context)
 
     @cached_property
     def cameras(self) -> Sequence[Camera]:
@@ -172,10 +174,13 @@ class Pruner:
         """
         if self._to_order is not None and kept_count < len(self._to_order):
             self.order.continue_with(self._to_order)
-        rows = self.order.kept(kept_count)
-        everything = np.arange(len(self.source))
-        pruned = self.order.merge(self.source, everything, 0, len(self.source) - len(rows)).select(rows)
+        rows, pruned = self._kept(kept_count)
         psnr_pruned = self.check_scorer.psnr(pruned)
+        is_first = self._last is None and self.order.merges
+        if is_first and self.check_scorer.psnr(self.source.select(rows)) > psnr_pruned:  # in piles, errors add up
+            self.order = self._new_order(merges=False)
+            rows, pruned = self._kept(kept_count)
+            psnr_pruned = self.check_scorer.psnr(pruned)
         if not self.refits or len(rows) == len(self.source):
             self._last = PrunedSubset(self, pruned, rows, psnr_pruned, psnr_pruned, refit_refused=False)
             return self._last
@@ -193,6 +198,12 @@ class Pruner:
         if part == _BRIEF:
             self.order.continue_with(model)
         return self._last
+
+    def _kept(self, kept_count: int) -> tuple[I64, SplatModel]:
+        """Return the indices of the kept splats, ascending, and the splats, with others merged into them."""
+        rows = self.order.kept(kept_count)
+        everything = np.arange(len(self.source))
+        return rows, self.order.merge(self.source, everything, 0, len(self.source) - len(rows)).select(rows)
 
     def _with_last_values(self, last: PrunedSubset, pruned: SplatModel, rows: I64) -> SplatModel:
         """Return splats with the values of an earlier refit, merged further, but for partners of splats that return.

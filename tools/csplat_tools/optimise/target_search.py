@@ -90,7 +90,7 @@ _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
 _FAR_COUNT = 0.05  # relative difference of two numbers of splats from which on a correction has more steps
 _LOWER = 2  # most further refits while the number of splats falls by more than that
-_FEW = 3  # most drafts of one coding, files that miss narrowly, and files with levels of detail
+_FEW = 3  # most drafts of one coding, files that miss narrowly, and corrections of files with levels of detail
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
@@ -204,7 +204,7 @@ class TargetSearch:
             log_factor = next_value(
                 0.0, [(log_tried, self._log_result(file)) for log_tried, file in made],
                 lambda log_tried: log_tried - log_level_0, bounds=(math.log(LEAST_QUANTISED), 0.0),
-                margin=0.5 * near if made else 0.0, tolerance=near, tries=_FEW,
+                margin=0.5 * near if made else 0.0, tolerance=near, tries=_FEW + 1,
             )  # fmt: skip
             if log_factor is None:
                 break
