@@ -171,8 +171,8 @@ class PruningOrder:
         self._value_rows, self._values = self.kept(len(refitted)), refitted
         assert len(self._value_rows) == len(refitted)
         self._left = self._value_rows
-        for name in ("rows", "partners", "errors"):
-            setattr(self, name, getattr(self, name)[:pruned_count])
+        self.rows, self.partners = self.rows[:pruned_count], self.partners[:pruned_count]
+        self.errors = self.errors[:pruned_count]
         ends = np.minimum(np.cumsum(self.rounds), pruned_count)
         self.rounds = [int(count) for count in np.diff(ends, prepend=0) if count]
         before = np.cumsum([0, *(len(group.cameras) for group in self.groups[:-1])])
@@ -249,7 +249,7 @@ class PruningOrder:
 def _merged_error(pruning_error: PruningError, pairs: I64) -> PruningError:
     """Return the errors after merges, until they are measured again: images of two splats that are alike add up."""
     error = pruning_error.error.copy()
-    error[pairs[0]] = np.square(np.sqrt(error[pairs]).sum(axis=0))
+    error[pairs[0]] = np.square(np.sqrt(np.maximum(error[pairs], 0.0)).sum(axis=0))
     return replace(pruning_error, error=error)
 
 
