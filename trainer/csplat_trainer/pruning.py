@@ -32,7 +32,9 @@ _UNDRAWN_KEY, _UNSEEN_KEY = -1.0, -0.5  # keys of splats to prune before all oth
 _F16_MAX = float(np.finfo(np.float16).max)
 # Views in which refitted splats are measured, if there are more; with twice as many, lego60k's file is no smaller.
 _VIEWS_AGAIN = 100
-_FEW_ALIKE = 0.005  # fraction of the splats in pairs that are alike below which later rounds search for none
+# Fraction of the splats in pairs that are alike below which later rounds of large scenes search for none; in a million
+# splats, a search takes 6 CPU seconds.
+_FEW_ALIKE, _LARGE = 0.005, 100_000
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -90,7 +92,7 @@ class PruningOrder:
             measurements of the others: two groups give twice the views at the cost of a single group.
         background: background colour of the views.
         merges: merge splats into others that are alike if that has a smaller error than pruning them; False from the
-            first round on that finds few.
+            first round on that finds few in a large scene.
         context: threads and progress.
         rows: [G] int64, indices of splats in the order of pruning.
         partners: [G] int64, index of the splat into which each is merged, or −1.
@@ -236,7 +238,7 @@ class PruningOrder:
             [2, P], of each pair the splat that stays, and the splat that is merged into it; no splat is in two pairs.
         """
         pairs, mismatch = find_alike(self._values.select(places))
-        self.merges = pairs.shape[1] >= _FEW_ALIKE * len(places)
+        self.merges = len(places) < _LARGE or pairs.shape[1] >= _FEW_ALIKE * len(places)
         smaller = keys[pairs].min(axis=0)
         is_possible = (smaller > 0.0) & np.isfinite(keys[pairs].max(axis=0))  # without an error, pruning is better
         pairs = np.ascontiguousarray(pairs[:, is_possible])
