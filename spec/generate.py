@@ -311,7 +311,7 @@ def rules_module(registry: Registry) -> str:
             masks.append(f"Mask({where}, {listed}, {bits_of(base)}, {refusal})")
     return "\n".join(
         [
-            "# SPDX-License-Identifier: CC0-1.0",  # of the folder `conformance`
+            "# SPDX-License-Identifier: CC0-1.0",  # the licence of `conformance`, where the file is written
             f'"""Allowed values of the fields of each structure, and the clauses that refuse others. {NOTICE}',
             "",
             "Only boundary tests use this module: decoders and validator are written from the text of the spec.",

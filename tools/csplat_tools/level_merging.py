@@ -17,8 +17,7 @@ from csplat.model import SplatModel
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64
 from csplat_render import kernels
-from csplat_render.neighbours import nearest_neighbours
-from csplat_trainer.merging import average_pairs, light_of, mean_areas, with_values
+from csplat_trainer.merging import average_pairs, light_of, mean_areas, neighbour_edges, with_values
 
 #: Neighbours with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long.
 NEIGHBOURS = 8
@@ -69,31 +68,12 @@ def merge_neighbours(
 
 def _choose_pairs(splats: SplatModel, nodes: I64, most: int, neighbours: int) -> I64:
     """Return the rows of disjoint pairs of neighbours in the same node, the cheapest, at most `most`, [2, M]."""
-    edges = _neighbours(splats.means, nodes, neighbours)
+    edges = neighbour_edges(splats.means, nodes, neighbours)
     cheapest = np.argsort(_merge_costs(splats, edges), kind="stable")
     partners = np.full(len(splats), -1, np.int64)
     kernels.call("pair_up", edges, cheapest, len(cheapest), most, partners)
     first = np.flatnonzero(partners > np.arange(len(splats)))
     return np.stack([first, partners[first]])
-
-
-def _neighbours(means: F32, nodes: I64, most: int) -> I64:
-    """Return each splat with its up to `most` nearest neighbours in the same node, as edges.
-
-    Args:
-        means: [N, 3].
-        nodes: [N], the node of each splat.
-
-    Returns:
-        [2, M] int64, the rows of both splats, the lower first; each edge once, ascending. M is 0 if each is alone.
-    """
-    by_node = np.argsort(nodes, kind="stable")
-    sizes = np.unique(nodes, return_counts=True)[1]
-    near = nearest_neighbours(means[by_node].astype(np.float64), most, sizes)[0]
-    starts, k = np.nonzero(near >= 0)
-    ends, starts = by_node[near[starts, k]], by_node[starts]
-    keys = np.sort(np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))  # one integer for both rows
-    return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(means)))
 
 
 def _merge_costs(splats: SplatModel, edges: I64) -> F64:

@@ -18,11 +18,12 @@ from csplat.model import SplatModel
 from csplat.types import F32, F64, I64
 from csplat_render.neighbours import nearest_neighbours
 
-_NEIGHBOURS = 4  # neighbours that a splat may be alike
-_MOST_APART = 1.0  # largest distance of centres in standard deviations, and largest factor e^x between sizes
+_NEIGHBOURS = 4  # nearest neighbours that are compared with a splat; larger groups of copies shrink in later rounds
+_MOST_APART = 1.0  # largest difference of log sizes, which is far above the mismatch that is allowed
+_FLATTEST = -15.0  # least log standard deviation relative to the largest, so that inverse variances stay finite
 _AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # row and column of each entry of a covariance
 _MISMATCH_MAX = 1.0  # estimated error of merging above which removing a splat is better
-_OPACITY_MAX = 0.9999  # of merged splats
+_OPACITY_MAX = 0.9999  # of merged splats, so that their logits are finite and refits can change them
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -40,11 +41,7 @@ def find_alike(splats: SplatModel) -> tuple[I64, F64]:
         of opacity a hide up to a² / 4 less or more than one. In three scenes the error of all merges is 0.9 to 1.8
         times the estimate.
     """
-    near = nearest_neighbours(splats.means.astype(np.float64), _NEIGHBOURS)[0]
-    first, k = np.nonzero(near >= 0)
-    edges = np.stack([first, near[first, k]])
-    keys = np.unique(edges.min(axis=0) * len(splats) + edges.max(axis=0))  # each edge once
-    edges = np.stack(np.divmod(keys, max(1, len(splats))))
+    edges = neighbour_edges(splats.means, np.zeros(len(splats), np.int64), _NEIGHBOURS)
     largest = _limited(splats.scales).max(axis=1, initial=-np.inf)
     sizes = largest[edges]
     distances = np.linalg.norm(splats.means[edges[1]].astype(np.float64) - splats.means[edges[0]], axis=1)
@@ -58,13 +55,32 @@ def find_alike(splats: SplatModel) -> tuple[I64, F64]:
     return np.where(light[0] >= light[1], edges, edges[::-1]), mismatch
 
 
+def neighbour_edges(means: F32, nodes: I64, most: int) -> I64:
+    """Return each splat with its up to `most` nearest neighbours in the same node, as edges.
+
+    Args:
+        means: [N, 3].
+        nodes: [N], the node of each splat.
+
+    Returns:
+        [2, M] int64, the rows of both splats, the lower first; each edge once, ascending. M is 0 if each is alone.
+    """
+    by_node = np.argsort(nodes, kind="stable")
+    sizes = np.unique(nodes, return_counts=True)[1]
+    near = nearest_neighbours(means[by_node].astype(np.float64), most, sizes)[0]
+    starts, k = np.nonzero(near >= 0)
+    ends, starts = by_node[near[starts, k]], by_node[starts]
+    keys = np.sort(np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))  # one integer for both rows
+    return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], max(1, len(means))))
+
+
 def _mismatch(splats: SplatModel, edges: I64, largest: F64) -> F64:
     """Return the mismatch of the splats of each edge; `largest` are their largest log standard deviations, [N]."""
     unit = largest[edges].max(axis=0)  # so that squares neither overflow nor vanish
     offsets = (splats.means[edges[1]].astype(np.float64) - splats.means[edges[0]]) * np.exp(-unit)[:, None]
     covariances, apart = [], np.zeros(edges.shape[1])
     for rows in edges:
-        variances = np.exp(2.0 * np.maximum(_limited(splats.scales[rows]) - unit[:, None], -15.0))
+        variances = np.exp(2.0 * np.maximum(_limited(splats.scales[rows]) - unit[:, None], _FLATTEST))
         covariances.append(covariance_entries(splats.quats[rows].T, variances.T))
         inverse = covariance_entries(splats.quats[rows].T, 1.0 / variances.T)
         squares = sum(
