@@ -46,7 +46,10 @@
 #define SPEC_TRANSFORMS_MAX 4
 #define SPEC_RUN_MAX 65536
 #define SPEC_JSON_DEPTH_MAX 64
-#define SPEC_EXTRA_NAME_MAX 62
+#define SPEC_EXTRA_COLUMNS_MAX 64
+#define SPEC_EXTRA_COMPONENTS_MAX 64
+#define SPEC_EXTRA_NAME_MAX 64
+#define SPEC_EXTRA_SEMANTIC_MAX 56
 #define SPEC_NO_PARENT INT64_C(4294967295)
 #define SPEC_ANCILLARY_ID_MIN 128
 #define SPEC_PRIVATE_ID_MIN 240
@@ -160,6 +163,13 @@
 #define SPEC_META_KEY_UP "up"
 #define SPEC_META_KEY_VIEW "view"
 #define SPEC_META_KEY_ESTIMATED "estimated"
+#define SPEC_SEMANTIC_LABEL "label"
+#define SPEC_SEMANTIC_OBJECT_ID "object_id"
+#define SPEC_SEMANTIC_NORMAL "normal"
+#define SPEC_SEMANTIC_INTENSITY "intensity"
+#define SPEC_SEMANTIC_TIME "time"
+#define SPEC_SEMANTIC_FRAME "frame"
+#define SPEC_SEMANTIC_FEATURE "feature:"
 #define SPEC_HEADER_SIZE 32
 #define SPEC_HEADER_AT_MAGIC 0
 #define SPEC_HEADER_AT_VERSION_MAJOR 8
@@ -209,10 +219,16 @@
 #define SPEC_CODEBOOK_RECORD_AT_RESERVED_0 5
 #define SPEC_CODEBOOK_RECORD_AT_RESERVED_1 6
 #define SPEC_CODEBOOK_RECORD_AT_SIZE 8
-#define SPEC_EXTRA_RECORD_SIZE 64
+#define SPEC_EXTRA_RECORD_SIZE 128
 #define SPEC_EXTRA_RECORD_AT_DTYPE 0
-#define SPEC_EXTRA_RECORD_AT_NAME_SIZE 1
-#define SPEC_EXTRA_RECORD_AT_NAME 2
+#define SPEC_EXTRA_RECORD_AT_COMPONENTS 1
+#define SPEC_EXTRA_RECORD_AT_CODING 2
+#define SPEC_EXTRA_RECORD_AT_NAME_SIZE 3
+#define SPEC_EXTRA_RECORD_AT_SEMANTIC_SIZE 4
+#define SPEC_EXTRA_RECORD_AT_RESERVED_0 5
+#define SPEC_EXTRA_RECORD_AT_RESERVED_1 6
+#define SPEC_EXTRA_RECORD_AT_NAME 8
+#define SPEC_EXTRA_RECORD_AT_SEMANTIC 72
 #define SPEC_DIRECTORY_RECORD_SIZE 28
 #define SPEC_DIRECTORY_RECORD_AT_TYPE 0
 #define SPEC_DIRECTORY_RECORD_AT_FLAGS 4
@@ -276,9 +292,6 @@
 #define SPEC_SPARSE_PARAMS_AT_EXPONENT 0
 #define SPEC_SPARSE_PARAMS_AT_RESERVED_0 2
 #define SPEC_SPARSE_PARAMS_AT_PRESENT_COUNT 4
-#define SPEC_RAW_PARAMS_SIZE 4
-#define SPEC_RAW_PARAMS_AT_COLUMN 0
-#define SPEC_RAW_PARAMS_AT_RESERVED_0 2
 #define SPEC_STREAM_HEAD_SIZE 20
 #define SPEC_STREAM_HEAD_AT_WIDTH 0
 #define SPEC_STREAM_HEAD_AT_CODER 1
@@ -312,7 +325,8 @@
 #define fail(...) (note(__VA_ARGS__), 0)
 
 enum { OPACITIES = SPEC_ATTRIBUTE_OPACITIES, SCALES, QUATS, MEANS, SH0, ATTRIBUTES_END = SH0 + SPEC_SH_DEGREE_MAX + 1 };
-enum { EXTRA = SPEC_SH_DEGREE_MAX + 1, LAYERS };         /* layers of a tile: 0, SH bands, extra columns */
+enum { EXTRA = SPEC_SH_DEGREE_MAX + 1, LAYERS };         /* layers of a tile: 0, SH bands, first of the extra columns */
+enum { EXTRA_TEXT = SPEC_EXTRA_NAME_MAX + 1 + SPEC_EXTRA_SEMANTIC_MAX + 1 };
 enum { COLUMNS_MAX = 3 * (2 * SPEC_SH_DEGREE_MAX + 1) }; /* integers per splat of the highest SH band */
 enum { PIECE = 64 };                                     /* splats transposed at a time, so that their rows stay in the L1 cache */
 
@@ -1212,28 +1226,47 @@ static int read_book(csplat *d, unsigned i, const uint8_t *p, uint64_t at)
     return 1;
 }
 
+/* Copy the first `size` bytes of a field of `room` bytes, and check that they are a text and that zeros follow. */
+static int read_text_field(csplat *d, const uint8_t *p, unsigned size, unsigned room, const char *clause, uint64_t at, char *copy)
+{
+    if (!is_utf8(p, size))
+        return fail(d, CSPLAT_E_VALUE, clause, at, "a name or semantic that is not UTF-8");
+    for (unsigned k = 0; k < size; k++)
+        if (p[k] < 0x20 || p[k] == 0x7F)
+            return fail(d, CSPLAT_E_VALUE, clause, at + k, "a name or semantic with control characters");
+    if (!all_zero(p + size, room - size))
+        return fail(d, CSPLAT_E_RESERVED, "EXR-3", at + size, "zeros do not follow a name or semantic");
+    memcpy(copy, p, size);
+    copy[size] = '\0';
+    return 1;
+}
+
 static int read_extra(csplat *d, unsigned i, const uint8_t *p, uint64_t at)
 {
     static const uint8_t bytes[] = {0, 1, 1, 2, 2, 4, 4, 4, 8};
     csplat_extra *e = &d->extras[i];
-    unsigned dtype = p[0], size = p[SPEC_EXTRA_RECORD_AT_NAME_SIZE];
-    const uint8_t *name = p + SPEC_EXTRA_RECORD_AT_NAME;
-    char *copy = d->extra_names + (size_t)i * (SPEC_EXTRA_NAME_MAX + 1);
+    const unsigned dtype = p[0], coding = p[SPEC_EXTRA_RECORD_AT_CODING];
+    const unsigned size = p[SPEC_EXTRA_RECORD_AT_NAME_SIZE], semantic_size = p[SPEC_EXTRA_RECORD_AT_SEMANTIC_SIZE];
+    char *copy = d->extra_names + (size_t)i * EXTRA_TEXT;
     if (dtype < SPEC_ANCILLARY_ID_MIN && (dtype < SPEC_EXTRA_DTYPE_U8 || dtype > SPEC_EXTRA_DTYPE_F64))
         return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at, "the type %u of extra columns", dtype);
+    if (coding < SPEC_ANCILLARY_ID_MIN && coding != SPEC_CODING_RAW)
+        return fail(d, CSPLAT_E_UNSUPPORTED, "EXR-6", at + SPEC_EXTRA_RECORD_AT_CODING, "the coding %u of extra columns", coding);
+    e->components = p[SPEC_EXTRA_RECORD_AT_COMPONENTS];
+    if (e->components < 1 || e->components > SPEC_EXTRA_COMPONENTS_MAX)
+        return fail(d, CSPLAT_E_VALUE, "EXR-5", at + SPEC_EXTRA_RECORD_AT_COMPONENTS, "%u components", e->components);
+    TRY(reserved(d, p + SPEC_EXTRA_RECORD_AT_RESERVED_0, 3, at + SPEC_EXTRA_RECORD_AT_RESERVED_0));
     if (size < 1 || size > SPEC_EXTRA_NAME_MAX)
         return fail(d, CSPLAT_E_VALUE, "EXR-1", at + SPEC_EXTRA_RECORD_AT_NAME_SIZE, "a name of %u bytes", size);
-    if (!is_utf8(name, size))
-        return fail(d, CSPLAT_E_VALUE, "EXR-2", at + SPEC_EXTRA_RECORD_AT_NAME, "a name that is not UTF-8");
-    for (unsigned k = 0; k < size; k++)
-        if (name[k] < 0x20 || name[k] == 0x7F)
-            return fail(d, CSPLAT_E_VALUE, "EXR-2", at + SPEC_EXTRA_RECORD_AT_NAME + k, "a name with control characters");
-    if (!all_zero(name + size, SPEC_EXTRA_NAME_MAX - size))
-        return fail(d, CSPLAT_E_RESERVED, "EXR-3", at + SPEC_EXTRA_RECORD_AT_NAME + size, "zeros do not follow a name");
-    memcpy(copy, name, size);
-    copy[size] = '\0';
+    if (semantic_size > SPEC_EXTRA_SEMANTIC_MAX)
+        return fail(d, CSPLAT_E_VALUE, "EXR-7", at + SPEC_EXTRA_RECORD_AT_SEMANTIC_SIZE, "a semantic of %u bytes", semantic_size);
+    TRY(read_text_field(d, p + SPEC_EXTRA_RECORD_AT_NAME, size, SPEC_EXTRA_NAME_MAX, "EXR-2", at + SPEC_EXTRA_RECORD_AT_NAME, copy));
     e->name = copy;
-    e->dtype = (uint8_t)(dtype < SPEC_ANCILLARY_ID_MIN ? dtype : 0);
+    copy += SPEC_EXTRA_NAME_MAX + 1;
+    TRY(read_text_field(d, p + SPEC_EXTRA_RECORD_AT_SEMANTIC, semantic_size, SPEC_EXTRA_SEMANTIC_MAX, "EXR-7",
+                        at + SPEC_EXTRA_RECORD_AT_SEMANTIC, copy));
+    e->semantic = copy;
+    e->dtype = (uint8_t)(dtype < SPEC_ANCILLARY_ID_MIN && coding == SPEC_CODING_RAW ? dtype : 0);
     e->bytes = bytes[e->dtype];
     return 1;
 }
@@ -1377,16 +1410,18 @@ static int read_directory(csplat *d, chunk *k, const uint8_t *p, uint64_t at)
 static int read_layers(csplat *d, tile *t, chunk *k, unsigned count, size_t stride, const uint8_t *p, uint64_t at)
 {
     const uint64_t first = at;
+    unsigned columns = 0;
     int last = -1;
     if (count == 0 || p[0] != SPEC_LAYER_GEOMETRY)
         return fail(d, CSPLAT_E_INDEX, "TIL-2", t->record + SPEC_TILE_RECORD_AT_LAYER_COUNT, "a tile without layer 0");
     for (unsigned i = 0; i < count; i++, p += stride, at += stride) {
-        unsigned layer = p[0];
+        unsigned layer = p[0], column;
         TRY(reserved(d, p + SPEC_LAYER_RECORD_AT_RESERVED_0, 3, at + SPEC_LAYER_RECORD_AT_RESERVED_0));
         if ((int)layer <= last)
             return fail(d, CSPLAT_E_INDEX, "TIL-2", at, "layer %u does not ascend", layer);
         last = (int)layer;
-        if (layer > SPEC_SH_DEGREE_MAX && layer != SPEC_LAYER_EXTRA && layer < SPEC_ANCILLARY_ID_MIN)
+        column = layer - SPEC_LAYER_EXTRA;
+        if (layer > SPEC_SH_DEGREE_MAX && column >= SPEC_EXTRA_COLUMNS_MAX && layer < SPEC_ANCILLARY_ID_MIN)
             return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at, "the layer %u", layer);
         if (layer <= SPEC_SH_DEGREE_MAX && layer > d->info.sh_degree)
             return fail(d, CSPLAT_E_INDEX, "TIL-3", at, "SH layer %u of a scene of SH degree %u", layer,
@@ -1396,12 +1431,18 @@ static int read_layers(csplat *d, tile *t, chunk *k, unsigned count, size_t stri
         memcpy(k[i].type, SPEC_CHUNK_TILE, 4);
         k[i].flags = SPEC_CHUNK_FLAG_CRITICAL;
         k[i].skipped = layer >= SPEC_ANCILLARY_ID_MIN || t->level > 0;
-        if (layer < SPEC_ANCILLARY_ID_MIN)
-            t->layers[layer == SPEC_LAYER_EXTRA ? (unsigned)EXTRA : layer] = &k[i];
+        if (layer <= SPEC_SH_DEGREE_MAX)
+            t->layers[layer] = &k[i];
+        else if (column < SPEC_EXTRA_COLUMNS_MAX) { /* they ascend: one after the other if all are there */
+            if (t->level > 0 || column >= d->info.extra_count || column != columns++)
+                return fail(d, CSPLAT_E_INDEX, "TIL-5", at, "a layer %u of extra columns in a tile of level %u", column, t->level);
+            if (column == 0)
+                t->layers[EXTRA] = &k[i];
+            k[i].skipped = !d->extras[column].bytes;
+        }
     }
-    if (!t->layers[EXTRA] != (!d->info.extra_count || t->level > 0))
-        return fail(d, CSPLAT_E_INDEX, "TIL-5", first, "a tile of level %u %s a layer of extra columns", t->level,
-                    t->layers[EXTRA] ? "has" : "lacks");
+    if (columns != (t->level > 0 ? 0 : d->info.extra_count))
+        return fail(d, CSPLAT_E_INDEX, "TIL-5", first, "%u layers of extra columns in a tile of level %u", columns, t->level);
     return 1;
 }
 
@@ -1537,7 +1578,7 @@ static int check_resource_level(csplat *d, uint64_t coarsest, int has_extras, in
     uint64_t all = plain, sizes[4] = {0};
     char needed = 'A';
     for (uint32_t i = 0; i < d->info.extra_count; i++)
-        all += d->extras[i].bytes;
+        all += (uint64_t)d->extras[i].bytes * d->extras[i].components;
     sizes[0] = d->index_size + 4;
     sizes[1] = book_sizes(d);
     for (uint32_t i = 0; i < d->tile_count; i++) {
@@ -1572,6 +1613,9 @@ static int read_index(csplat *d)
     counts[0] = d->attribute_count = head[SPEC_INDEX_HEAD_AT_ATTRIBUTE_COUNT];
     counts[1] = info->codebook_count = get_u16(head + SPEC_INDEX_HEAD_AT_CODEBOOK_COUNT);
     counts[2] = info->extra_count = get_u16(head + SPEC_INDEX_HEAD_AT_EXTRA_COUNT);
+    if (info->extra_count > SPEC_EXTRA_COLUMNS_MAX)
+        return fail(d, CSPLAT_E_VALUE, "EXR-4", SPEC_HEADER_SIZE + SPEC_INDEX_HEAD_AT_EXTRA_COUNT, "%u extra columns",
+                    (unsigned)info->extra_count);
     counts[3] = get_u16(head + SPEC_INDEX_HEAD_AT_DIRECTORY_COUNT);
     at = end = sizes[0];
     for (int i = 0; i < 4; i++)
@@ -1590,7 +1634,7 @@ static int read_index(csplat *d)
     memset(d->books, 0, (size_t)counts[1] * sizeof *d->books);
     TRY(d->public_books = allocate(d, counts[1], sizeof *d->public_books));
     TRY(d->extras = allocate(d, counts[2], sizeof *d->extras));
-    TRY(d->extra_names = allocate(d, counts[2], SPEC_EXTRA_NAME_MAX + 1));
+    TRY(d->extra_names = allocate(d, counts[2], EXTRA_TEXT));
     TRY(d->chunks = allocate(d, d->chunk_count, sizeof *d->chunks));
     TRY(d->tiles = allocate(d, d->tile_count, sizeof *d->tiles));
     info->codebooks = d->public_books;
@@ -2317,15 +2361,14 @@ static void begin_tile(csplat *d, const tile *t)
     d->current = t;
 }
 
-static int load_layer(csplat *d, const tile *t, unsigned layer, unsigned blocks, cursor *c)
+static int load_layer(csplat *d, const chunk *k, unsigned id, unsigned blocks, cursor *c)
 {
-    const unsigned id = layer == EXTRA ? SPEC_LAYER_EXTRA : layer;
     const uint8_t *p;
-    TRY(load(d, t->layers[layer], &d->chunk_bytes, CSPLAT_E_STREAM, "TLE-3", c));
+    TRY(load(d, k, &d->chunk_bytes, CSPLAT_E_STREAM, "TLE-3", c));
     TRY(take(d, c, SPEC_TILE_HEAD_SIZE, &p));
     if (p[SPEC_TILE_HEAD_AT_LAYER] != id)
         return fail(d, CSPLAT_E_INDEX, "TLE-1", c->offset, "layer %u, the record has %u", p[0], id);
-    if (p[SPEC_TILE_HEAD_AT_BLOCK_COUNT] != (blocks & 255) || blocks > 255)
+    if (p[SPEC_TILE_HEAD_AT_BLOCK_COUNT] != blocks)
         return fail(d, CSPLAT_E_STREAM, "TLE-2", c->offset + SPEC_TILE_HEAD_AT_BLOCK_COUNT, "%u blocks, expected %u",
                     p[SPEC_TILE_HEAD_AT_BLOCK_COUNT], blocks);
     return reserved(d, p + SPEC_TILE_HEAD_AT_RESERVED_0, 2, c->offset + SPEC_TILE_HEAD_AT_RESERVED_0);
@@ -2389,7 +2432,7 @@ static int read_geometry(csplat *d, const tile *t, const sink *out)
     cursor c;
     block b;
     begin_tile(d, t);
-    TRY(load_layer(d, t, 0, 5, &c));
+    TRY(load_layer(d, t->layers[0], 0, 5, &c));
     for (unsigned id = OPACITIES; id <= SH0; id++) {
         TRY(read_block(d, &c, t, id, &b));
         if (id == SCALES)
@@ -2411,7 +2454,7 @@ static int read_band(csplat *d, const tile *t, unsigned band, block *b)
     memset(b, 0, sizeof *b);
     if (band > d->info.sh_degree || !t->layers[band])
         return 1;
-    TRY(load_layer(d, t, band, 1, &c));
+    TRY(load_layer(d, t->layers[band], band, 1, &c));
     TRY(read_block(d, &c, t, SH0 + band, b));
     return at_end(d, &c);
 }
@@ -2435,7 +2478,7 @@ static int read_band_alone(csplat *d, const tile *t, unsigned band, block *b)
     if (band <= d->info.sh_degree && t->layers[band] && may_lack_indices(d, t, band)) {
         cursor c;
         const book *k;
-        TRY(load_layer(d, t, band, 1, &c));
+        TRY(load_layer(d, t->layers[band], band, 1, &c));
         if (c.size - c.at >= SPEC_BLOCK_HEAD_SIZE + SPEC_CODEBOOK_PARAMS_SIZE &&
             c.data[c.at + SPEC_BLOCK_HEAD_AT_CODING] == SPEC_CODING_CODEBOOK) {
             k = find_book(d, get_u16(c.data + c.at + SPEC_BLOCK_HEAD_SIZE));
@@ -2446,46 +2489,48 @@ static int read_band_alone(csplat *d, const tile *t, unsigned band, block *b)
     return read_band(d, t, band, b);
 }
 
+/* Copy the values of an extra column, component by component, to [n][components]. */
+static void put_extra(const csplat_extra *e, const uint64_t *values, size_t n, void *out)
+{
+    for (size_t component = 0; component < e->components; component++)
+        for (size_t i = 0, to = component; i < n; i++, to += e->components, values++)
+            if (e->bytes == 1)
+                ((uint8_t *)out)[to] = (uint8_t)*values;
+            else if (e->bytes == 2)
+                ((uint16_t *)out)[to] = (uint16_t)*values;
+            else if (e->bytes == 4)
+                ((uint32_t *)out)[to] = (uint32_t)*values;
+            else
+                ((uint64_t *)out)[to] = *values;
+}
+
+/* Read the columns with an output, or check all if `out` is NULL. */
 static int read_extras(csplat *d, const tile *t, void *const *out)
 {
-    cursor c;
     if (!d->info.extra_count)
         return 1;
     if (t->level > 0)
         return refuse(d, "tiles above level 0 have no extra columns");
-    TRY(load_layer(d, t, EXTRA, d->info.extra_count, &c));
     for (unsigned i = 0; i < d->info.extra_count; i++) {
         const csplat_extra *e = &d->extras[i];
-        uint64_t *values;
-        const uint8_t *p;
-        uint64_t at;
         unsigned coding;
+        cursor c;
         stream s;
-        TRY(read_block_head(d, &c, SPEC_ATTRIBUTE_EXTRA, 0, &coding));
-        at = place(&c);
-        TRY(take(d, &c, SPEC_RAW_PARAMS_SIZE, &p));
-        TRY(reserved(d, p + SPEC_RAW_PARAMS_AT_RESERVED_0, 2, at + SPEC_RAW_PARAMS_AT_RESERVED_0));
-        if (get_u16(p) != i)
-            return fail(d, CSPLAT_E_STREAM, "RAW-1", at, "the column %u, expected %u", get_u16(p), i);
-        TRY(read_stream(d, &c, t->splat_count, 8, &s));
-        if (e->bytes && s.width != e->bytes)
-            return fail(d, CSPLAT_E_STREAM, "RAW-2", s.offset, "a width of %u, expected %u", s.width, e->bytes);
-        if (!e->bytes || !out || !out[i])
+        if (!e->bytes || (out && !out[i]))
             continue;
-        TRY(reserve(d, &d->codes, s.count, sizeof *values));
-        values = d->codes.data;
-        undo64(&s, values);
-        for (uint32_t k = 0; k < s.count; k++)
-            if (e->bytes == 1)
-                ((uint8_t *)out[i])[k] = (uint8_t)values[k];
-            else if (e->bytes == 2)
-                ((uint16_t *)out[i])[k] = (uint16_t)values[k];
-            else if (e->bytes == 4)
-                ((uint32_t *)out[i])[k] = (uint32_t)values[k];
-            else
-                ((uint64_t *)out[i])[k] = values[k];
+        TRY(load_layer(d, t->layers[EXTRA] + i, SPEC_LAYER_EXTRA + i, 1, &c));
+        TRY(read_block_head(d, &c, SPEC_ATTRIBUTE_EXTRA, 0, &coding));
+        TRY(read_stream(d, &c, t->splat_count * e->components, 8, &s));
+        if (s.width != e->bytes)
+            return fail(d, CSPLAT_E_STREAM, "RAW-2", s.offset, "a width of %u, expected %u", s.width, e->bytes);
+        TRY(at_end(d, &c));
+        if (!out)
+            continue;
+        TRY(reserve(d, &d->codes, s.count, sizeof(uint64_t)));
+        undo64(&s, d->codes.data);
+        put_extra(e, d->codes.data, t->splat_count, out[i]);
     }
-    return at_end(d, &c);
+    return 1;
 }
 
 /* JSON (5.4) ----------------------------------------------------------------------------------------------------------- */
@@ -3482,7 +3527,7 @@ static int check_budget(csplat *d, unsigned degree, int whole)
     const uint64_t tables = book_sizes(d);
     uint64_t per_splat = 4 * (14 + 3 * (uint64_t)coefficients_of(degree));
     for (uint32_t i = 0; whole && i < info->extra_count; i++)
-        per_splat += info->extras[i].bytes;
+        per_splat += (uint64_t)info->extras[i].bytes * info->extras[i].components;
     if (info->splat_count > d->options.splats_max)
         return fail(d, CSPLAT_E_LIMIT, "LIM-1", SPEC_HEADER_SIZE + SPEC_INDEX_HEAD_AT_SPLAT_COUNT,
                     "%llu splats, the limit is %llu", (unsigned long long)info->splat_count,
@@ -3513,7 +3558,7 @@ static int decode(csplat *d, unsigned degree, int whole, csplat_scene *scene)
         scene->extras[i] = NULL;
     for (uint32_t i = 0; whole && i < d->info.extra_count; i++)
         if (d->extras[i].bytes)
-            TRY(scene->extras[i] = allocate(d, n, d->extras[i].bytes));
+            TRY(scene->extras[i] = allocate(d, n, (size_t)d->extras[i].bytes * d->extras[i].components));
     if (whole) {
         TRY(check(d));
         TRY(at = allocate(d, d->info.extra_count, sizeof *at));
@@ -3530,7 +3575,7 @@ static int decode(csplat *d, unsigned degree, int whole, csplat_scene *scene)
         of_tile.shN = v->shN + 3 * coefficients * first;
         worked = read_tile_floats(d, t, degree, &of_tile);
         for (uint32_t k = 0; whole && k < d->info.extra_count; k++)
-            at[k] = scene->extras[k] ? (char *)scene->extras[k] + first * d->extras[k].bytes : NULL;
+            at[k] = scene->extras[k] ? (char *)scene->extras[k] + first * d->extras[k].bytes * d->extras[k].components : NULL;
         worked = worked && (!whole || read_extras(d, t, at));
     }
     release(d, at);

@@ -93,8 +93,10 @@ typedef struct csplat_options {
 
 typedef struct csplat_extra {
     const char *name; /* UTF-8, NUL-terminated */
-    uint8_t dtype;    /* 1 u8, 2 i8, 3 u16, 4 i16, 5 u32, 6 i32, 7 f32, 8 f64; 0: unknown, never returned */
+    uint8_t dtype;    /* 1 u8, 2 i8, 3 u16, 4 i16, 5 u32, 6 i32, 7 f32, 8 f64; 0: unknown type or coding, never returned */
     uint8_t bytes;    /* per value; 0 if unknown */
+    uint8_t components;   /* values of a splat, 1 to 64 */
+    const char *semantic; /* what they mean, "label" or "feature:...": UTF-8, NUL-terminated; "" if that is not stated */
 } csplat_extra;
 
 typedef struct csplat_codebook {
@@ -172,7 +174,7 @@ typedef struct csplat_scene {
     uint64_t splat_count;
     unsigned sh_degree; /* degree of shN */
     csplat_floats values;
-    void **extras; /* [extra_count], values of each column's type; NULL for unknown types */
+    void **extras; /* [extra_count], [n][components] of each column's type; NULL for unknown types and codings */
 } csplat_scene;
 
 /* The integer arrays of the specification, 9.2, for tests; NULL to skip one. */
@@ -247,7 +249,8 @@ void csplat_free_scene(csplat *file, csplat_scene *scene);
 csplat_code csplat_read_tile(csplat *file, uint32_t tile, unsigned sh_degree, const csplat_floats *out);
 /* Read an SH band, [n][2 * band + 1][3]; 0 if the tile leaves it out. */
 csplat_code csplat_read_band(csplat *file, uint32_t tile, unsigned band, float *out);
-/* Read extra columns: out[i], unless it is NULL, receives the values of column i. Tiles above level 0 have none: E_INPUT. */
+/* Read extra columns: out[i] receives the values of column i; columns whose out[i] is NULL are not read. If out is NULL, all are
+ * read and checked. Tiles above level 0 have none: E_INPUT. */
 csplat_code csplat_read_extras(csplat *file, uint32_t tile, void *const *out);
 csplat_code csplat_read_integers(csplat *file, uint32_t tile, const csplat_integers *out);
 

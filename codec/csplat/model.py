@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.errors import InputError, counted
 from csplat.plugins import load_plugins
 from csplat.scene_metadata import SceneMetadata
@@ -47,7 +48,7 @@ class SplatModel:
         means_double: [N, 3] float64, centres in the source's coordinates; `means` are these minus `origin`, rounded.
             `None` if `origin` and `means` are exact.
         metadata: metadata of the scene.
-        extra: additional columns by name, each [N], integer or floating.
+        extra: additional columns by name, each [N] or [N, C] for C = 2 to 64 values of a splat, integer or floating.
 
     Raises:
         InputError: an array has the wrong shape or dtype, contains NaN or infinity, or is out of range; or another
@@ -127,6 +128,11 @@ class SplatModel:
         values["extra"] = {name: rows(column) for name, column in self.extra.items()}
         values["means_double"] = None if self.means_double is None else rows(self.means_double)
         return trusted_model(**values)
+
+
+def splat_dtype(column: NDArray[Any]) -> np.dtype[Any]:
+    """Return the dtype of a splat in an extra column [N] or [N, C]; it has the shape [C] in the latter case."""
+    return np.dtype((column.dtype, column.shape[1:]))
 
 
 def trusted_model(**values: Any) -> SplatModel:
@@ -249,10 +255,12 @@ def _check_quats(quats: F32) -> None:
 
 
 def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
-    """Raise an `InputError` unless extra columns are arrays [n] of integers or floats."""
+    """Raise an `InputError` unless extra columns are arrays [n] or [n, 2 to 64] of integers or floats."""
+    most = _spec.EXTRA_COMPONENTS_MAX
     for name, column in extra.items():
-        if not isinstance(column, np.ndarray) or column.shape != (n,):
-            raise InputError(f"extra column {name!r} is not an array of {n} values")
+        shape = column.shape if isinstance(column, np.ndarray) else ()
+        if shape[:1] != (n,) or len(shape) > 2 or not 2 <= (*shape, 2)[1] <= most:
+            raise InputError(f"extra column {name!r} is not an array of {n} values, or of {n} times 2 to {most}")
         if column.dtype.kind not in "iuf":
             raise InputError(f"extra column {name!r} is {column.dtype}, expected integers or floats")
 

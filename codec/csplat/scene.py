@@ -18,7 +18,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat.model import SplatModel
+from csplat.model import SplatModel, splat_dtype
 from csplat.scene_metadata import SceneMetadata
 from csplat.types import Progress
 
@@ -40,7 +40,7 @@ class Scene:
             metadata of the scene.
         metadata: metadata of the scene.
         origin: as in `SplatModel`.
-        extra: dtypes of the extra columns, by name.
+        extra: dtypes of the extra columns, by name; with a shape for several values of a splat.
         has_doubles: models have `means_double`.
         findings: findings so far; the first iteration over the blocks may add some.
         format: name of the format that the scene is read from; "" if it is in memory.
@@ -88,7 +88,7 @@ class Scene:
             model: a model, perhaps without splats.
             count, reader, findings: as above.
         """
-        extra = {name: column.dtype for name, column in model.extra.items()}
+        extra = {name: splat_dtype(column) for name, column in model.extra.items()}
         doubles = model.means_double is not None
         listed = findings if isinstance(findings, list) else list(findings)
         return cls(count, model.sh_degree, reader, model.metadata, model.origin, extra, doubles, listed)
@@ -179,7 +179,7 @@ class Scene:
             sh_degree=model.sh_degree,
             metadata=model.metadata,
             origin=model.origin,
-            extra={name: column.dtype for name, column in model.extra.items()},
+            extra={name: splat_dtype(column) for name, column in model.extra.items()},
             has_doubles=model.means_double is not None,
             reader=lambda: map(change, self.blocks()),
         )

@@ -59,6 +59,8 @@ class SceneMetadata:
             `TrainingRecord`), `up` (three numbers), `view` (initial camera of a viewer, in the form of `cameras`, and
             `from`: `training`, `estimate` or `author`), `estimated` (list of the keys whose values are estimates).
             Properties return their values if these are valid.
+        semantics: what extra columns mean, by the column's name: `label`, `object_id`, `normal`, `feature:` and the
+            name of a model, and so on (registry of semantics, spec 12).
 
     Raises:
         InputError: the coordinate system, the unit or the colour space is invalid.
@@ -71,6 +73,7 @@ class SceneMetadata:
     colour_space: str = SRGB
     cameras: Sequence[Mapping[str, Any]] | None = None
     entries: Mapping[str, Any] = field(default_factory=dict)
+    semantics: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.coordinate_system != UNSPECIFIED:

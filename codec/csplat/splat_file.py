@@ -68,7 +68,7 @@ class SplatFile(Scene):
             self._head = _read_head(store, window, limits)
             self.header = header = read_header(window.view, limits=limits)
         self.count, self.sh_degree, self.origin = header.splat_count, header.sh_degree, header.origin
-        self.extra = {column.name: np.dtype(column.dtype) for column in header.extras if column.dtype is not None}
+        self.extra = {column.name: column.splat_dtype for column in header.extras if column.dtype is not None}
         self.reader, self.has_doubles, self.file_axes = self.models, False, ""
         self.format, self.name, self.size_bytes = "csplat", store.name, store.size
         self.findings, self.in_memory, self.modified_ns = [], None, 0

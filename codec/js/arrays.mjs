@@ -27,7 +27,7 @@ export const shRows = (shDegree) => (shDegree + 1) ** 2 - 1;
 export function arrayBytes(count, shDegree, extras, integers) {
   const lattice = 3 + 3 + 3 * (shRows(shDegree) + 1);
   const values = integers ? 8 * lattice + 4 + 12 : 4 * (lattice + 1 + 4);
-  return count * extras.reduce((sum, extra) => sum + extra.bytes, values);
+  return count * extras.reduce((sum, extra) => sum + extra.components * extra.bytes, values);
 }
 
 /** Arrays of floats. */

@@ -45,9 +45,9 @@ export class Assembly {
    * @param {TileRecord} tile
    * @param {number} first index in the arrays of the tile's first splat
    */
-  put({ blocks, extras }, tile, first) {
+  put({ layer, blocks, extra }, tile, first) {
     for (const block of blocks) this.arrays.put(block, tile, first);
-    if (this.extras.records.length) this.extras.put(extras, first);
+    if (extra) this.extras.put(layer, extra, tile.splatCount, first);
   }
 
   /**
@@ -60,7 +60,10 @@ export class Assembly {
     const { arrays } = this;
     if (!(arrays instanceof FloatArrays)) return;
     for (const [name, { array, width }] of arrays.columns()) array.set(fields[name], width * first);
-    for (const [name, values] of Object.entries(this.extras.byName())) values.set(fields.extra[name], first);
+    for (const [name, values] of Object.entries(this.extras.byName())) {
+      const components = values.length / this.count;
+      values.set(fields.extra[name], components * first);
+    }
   }
 
   fields() {

@@ -67,10 +67,16 @@ export interface CodebookRecord {
 
 export interface ExtraRecord {
   name: string;
-  /** null if this decoder does not know the type; the column is then not returned. */
+  /** null if this decoder does not know type or coding; the column is then not returned. */
   dtype: 'u8' | 'i8' | 'u16' | 'i16' | 'u32' | 'i32' | 'f32' | 'f64' | null;
-  /** Bytes per value; 0 if the type is not known. */
+  /** Bytes per value; 0 if `dtype` is null. */
   bytes: number;
+  /** Values of a splat, 1 to 64. */
+  components: number;
+  /** Meaning of the values: `label`, `normal`, `feature:` and a model's name, …; empty if it is not stated. */
+  semantic: string;
+  /** Layer of the column. */
+  layer: number;
 }
 
 /** A range of bytes in a file. */
@@ -237,7 +243,7 @@ export interface Splats {
   sh0: Float32Array;
   /** [count, K, 3] */
   shN: Float32Array;
-  /** Extra columns by name. None if a tile of a coarser level is included: only level 0 has them. */
+  /** Extra columns by name, [count, components]. None if a tile of a coarser level is included: only level 0 has them. */
   extra: Record<string, ExtraArray>;
 }
 

@@ -19,8 +19,11 @@ const EXTRA_VIEWS = {
   f64: (buffer) => new Float64Array(buffer),
 };
 
+/** Unsigned integers by width; those of eight bytes are two halves. @type {Record<number, any>} */
+const WORDS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array, 8: Uint32Array };
+
 /**
- * Return true if this version knows the type of a column; other columns are not returned (ANC-3).
+ * Return true if this version knows type and coding of a column; other columns are not returned (ANC-3).
  *
  * @param {ExtraRecord} record
  * @returns {record is ExtraRecord & {dtype: string}}
@@ -35,25 +38,25 @@ export class ExtraArrays {
    */
   constructor(count, records) {
     this.records = records.filter(isKnown);
-    this.buffers = this.records.map(({ bytes }) => new ArrayBuffer(count * bytes));
+    this.buffers = this.records.map(({ components, bytes }) => new ArrayBuffer(count * components * bytes));
   }
 
   /**
-   * @param {Elements[]} columns
+   * @param {number} layer of the column
+   * @param {Elements} elements those of component 0 of all splats, then those of component 1, and so on
+   * @param {number} count splats
    * @param {number} first index of the first splat
    */
-  put(columns, first) {
-    for (const [column, { low, high, width }] of columns.entries()) {
-      const buffer = this.buffers[column];
-      if (width === 1) new Uint8Array(buffer).set(low, first);
-      else if (width === 2) new Uint16Array(buffer).set(low, first);
-      else if (high === null) new Uint32Array(buffer).set(low, first);
-      else {
-        const halves = new Uint32Array(buffer);
-        for (let i = 0; i < low.length; i++) {
-          halves[2 * (first + i)] = low[i];
-          halves[2 * (first + i) + 1] = high[i];
-        }
+  put(layer, { low, high, width }, count, first) {
+    const column = this.records.findIndex((record) => record.layer === layer);
+    if (column < 0) return; // some of the tiles are coarser and have none
+    const { components } = this.records[column];
+    const array = new WORDS[width](this.buffers[column]);
+    const stride = high === null ? 1 : 2;
+    for (let component = 0, from = 0; component < components; component++) {
+      for (let to = components * first + component, i = 0; i < count; i++, from++, to += components) {
+        array[stride * to] = low[from];
+        if (high !== null) array[stride * to + 1] = high[from];
       }
     }
   }

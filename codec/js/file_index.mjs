@@ -78,7 +78,9 @@ export function readIndex(bytes, file, limits) {
   /** @type {ExtraRecord[]} */
   const extras = [];
   const names = new Set();
-  for (let i = 0; i < head.extra_count; i++) extras.push(readExtra(index, head.extra_size, names));
+  for (let i = 0; i < head.extra_count; i++) {
+    extras.push(readExtra(index, head.extra_size, spec.LAYER_EXTRA + i, names));
+  }
   const directoryOffset = index.offset;
   const directory = [];
   for (let i = 0; i < head.directory_count; i++) directory.push(readDirectory(index, head.directory_size));
@@ -149,6 +151,8 @@ function readScene(head) {
     if (value < spec.ANCILLARY_ID_MIN && nameOf(names, value) === undefined)
       throw fault(ERROR_UNSUPPORTED, at + AT_HEAD[field], 'RES-2', `${field} ${value} is not supported`);
   }
+  if (head.extra_count > spec.EXTRA_COLUMNS_MAX)
+    throw fault(ERROR_VALUE, at + AT_HEAD.extra_count, 'EXR-4', `${head.extra_count} extra columns`);
   const flags = spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;
   if (head.scene_flags & ~flags)
     throw fault(ERROR_RESERVED, at + AT_HEAD.scene_flags, 'RES-1', `scene flags ${head.scene_flags}`);
@@ -316,34 +320,60 @@ function readCodebook(index, recordSize, before, shDegree) {
 /**
  * @param {Payload} index
  * @param {number} recordSize
+ * @param {number} layer of the column
  * @param {Set<string>} names names of the previous columns
  * @returns {ExtraRecord}
  */
-function readExtra(index, recordSize, names) {
+function readExtra(index, recordSize, layer, names) {
   const places = spec.EXTRA_RECORD_OFFSETS;
-  const { fields, offset } = index.read(spec.unpackExtraRecord, recordSize, {}, 'an extra column record');
+  const { fields, offset } = index.read(
+    spec.unpackExtraRecord,
+    recordSize,
+    spec.EXTRA_RECORD_RESERVED,
+    'an extra column record',
+  );
   const dtype = nameOf(spec.EXTRA_DTYPE_NAMES, fields.dtype);
   if (dtype === undefined && fields.dtype < spec.ANCILLARY_ID_MIN)
     throw fault(ERROR_UNSUPPORTED, offset, 'RES-2', `type ${fields.dtype} of an extra column`);
-  const size = fields.name_size;
-  if (size < 1 || size > spec.EXTRA_NAME_MAX)
-    throw fault(ERROR_VALUE, offset + places.name_size, 'EXR-1', `a name of ${size} bytes`);
-  const name = decodeUtf8(fields.name.slice(0, size));
-  if (name === null) {
-    let sound = size - 1; // length of the longest valid UTF-8 prefix
-    while (decodeUtf8(fields.name.slice(0, sound)) === null) sound--;
-    throw fault(ERROR_VALUE, offset + places.name + sound, 'EXR-2', 'a name that is not UTF-8');
-  }
-  if (/[\u0000-\u001f\u007f]/.test(name))
-    throw fault(ERROR_VALUE, offset + places.name, 'EXR-2', 'a control character in a name');
+  const { coding, components, name_size: nameSize, semantic_size: semanticSize } = fields;
+  if (coding !== spec.CODING_RAW && coding < spec.ANCILLARY_ID_MIN)
+    throw fault(ERROR_UNSUPPORTED, offset + places.coding, 'EXR-6', `coding ${coding} of an extra column`);
+  if (components < 1 || components > spec.EXTRA_COMPONENTS_MAX)
+    throw fault(ERROR_VALUE, offset + places.components, 'EXR-5', `${components} components`);
+  if (nameSize < 1 || nameSize > spec.EXTRA_NAME_MAX)
+    throw fault(ERROR_VALUE, offset + places.name_size, 'EXR-1', `a name of ${nameSize} bytes`);
+  if (semanticSize > spec.EXTRA_SEMANTIC_MAX)
+    throw fault(ERROR_VALUE, offset + places.semantic_size, 'EXR-7', `a semantic of ${semanticSize} bytes`);
+  const name = readText(fields.name, nameSize, offset + places.name, 'EXR-2', 'name');
+  const semantic = readText(fields.semantic, semanticSize, offset + places.semantic, 'EXR-7', 'semantic');
   if (names.has(name)) throw fault(ERROR_VALUE, offset + places.name, 'EXR-2', `two columns ${JSON.stringify(name)}`);
   names.add(name);
-  const rest = fields.name.subarray(size).find((byte) => byte !== 0);
-  if (rest !== undefined)
-    throw fault(ERROR_RESERVED, offset + places.name + size, 'EXR-3', `a byte of ${rest} after the name`);
-  if (dtype === undefined) return { name, dtype: null, bytes: 0 };
+  if (dtype === undefined || coding !== spec.CODING_RAW)
+    return { name, dtype: null, bytes: 0, components, semantic, layer };
   const bytes = spec.EXTRA_DTYPE_BYTES[/** @type {keyof typeof spec.EXTRA_DTYPE_BYTES} */ (fields.dtype)];
-  return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes };
+  return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes, components, semantic, layer };
+}
+
+/**
+ * Return the first bytes of a field as text.
+ *
+ * @param {Uint8Array} field
+ * @param {number} size bytes of the text; zeros follow
+ * @param {number} offset of the field
+ * @param {string} clause of a text that is invalid
+ * @param {string} what
+ */
+function readText(field, size, offset, clause, what) {
+  const text = decodeUtf8(field.slice(0, size));
+  if (text === null) {
+    let sound = size - 1; // length of the longest valid UTF-8 prefix
+    while (decodeUtf8(field.slice(0, sound)) === null) sound--;
+    throw fault(ERROR_VALUE, offset + sound, clause, `a ${what} that is not UTF-8`);
+  }
+  if (/[\u0000-\u001f\u007f]/.test(text)) throw fault(ERROR_VALUE, offset, clause, `a control character in a ${what}`);
+  const rest = field.subarray(size).find((byte) => byte !== 0);
+  if (rest !== undefined) throw fault(ERROR_RESERVED, offset + size, 'EXR-3', `a byte of ${rest} after the ${what}`);
+  return text;
 }
 
 /**

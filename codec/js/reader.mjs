@@ -14,6 +14,7 @@ import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { FormatError, InputError } from './errors.mjs';
 import { checkIndexBudget, readIndex } from './file_index.mjs';
+import { isKnown } from './extras.mjs';
 import { checkedInflate, platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed_layers.mjs';
@@ -72,9 +73,12 @@ async function explained(error, source, opening) {
  *
  * @param {TileRecord} record
  * @param {{shDegree: number, extra: boolean}} wanted
+ * @param {Header} header
  */
-const wantedLayers = ({ layers }, { shDegree, extra }) =>
-  layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
+const wantedLayers = ({ layers }, { shDegree, extra }, { extras }) =>
+  layers.filter(
+    ({ layer }) => layer <= shDegree || (extra && extras.some((one) => one.layer === layer && isKnown(one))),
+  );
 
 /** Reads parts of a file and checks the CRC of each. */
 export class Reader {
@@ -255,7 +259,7 @@ export class Reader {
    */
   async fill(assembly, record, first, signal) {
     const { integers } = assembly.wanted;
-    const places = wantedLayers(record, assembly.wanted);
+    const places = wantedLayers(record, assembly.wanted, this.header);
     const bytes = await Promise.all(places.map((place) => this.fetch(place, signal)));
     const chunks = new Map(places.map((place, i) => [place, bytes[i]]));
     const { arrays } = assembly;
@@ -264,7 +268,7 @@ export class Reader {
       (await this.byCompiled(record, chunks, (decoder) => decoder.readTile(record, arrays, first)));
     const tile = this.tileOf(record);
     for (const [place, chunk] of chunks) {
-      if (made && place.layer !== spec.LAYER_EXTRA) continue;
+      if (made && place.layer < spec.LAYER_EXTRA) continue;
       assembly.put(await tile.readLayer(this.opened(chunk, place), place, integers), record, first);
     }
     this.release(tile);
@@ -280,7 +284,7 @@ export class Reader {
    */
   async partsOf(wanted, record, signal) {
     const parts = record ? [] : [...this.opening];
-    for (const place of record ? wantedLayers(record, wanted) : []) {
+    for (const place of record ? wantedLayers(record, wanted, this.header) : []) {
       parts.push([place.offset, await this.fetch(place, signal)]);
     }
     for (const [key, { layer, offset }] of record ? [] : this.codebookChunks) {
@@ -314,7 +318,7 @@ export class Reader {
     const packed = form === 'packed';
     const integers = !packed && checkedForm(form);
     if (layer === spec.LAYER_GEOMETRY && !packed) return this.decodeTile(index, { shDegree: 0, form, signal });
-    if (layer === spec.LAYER_EXTRA || !Object.hasOwn(spec.LAYER_NAMES, layer)) {
+    if (layer >= spec.LAYER_EXTRA || !Object.hasOwn(spec.LAYER_NAMES, layer)) {
       throw new InputError(`layer ${layer}: the layers of colour are 0 to ${spec.SH_DEGREE_MAX}`);
     }
     const place = record.layers.find((one) => one.layer === layer);

@@ -12,7 +12,6 @@ import {
   readValues,
 } from './codings.mjs';
 import { fault } from './errors.mjs';
-import { isKnown } from './extras.mjs';
 import { ldexp } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import * as spec from './spec.mjs';
@@ -58,7 +57,7 @@ const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
  *
  * The result of decoding a layer.
  *
- * @typedef {{blocks: Block[], extras: Elements[]}} Layer
+ * @typedef {{layer: number, blocks: Block[], extra?: Elements}} Layer
  */
 
 /** Decodes the layers of one tile and keeps the data of earlier layers that later ones need. */
@@ -117,21 +116,16 @@ export class Tile {
     if (fields.layer !== layer)
       throw fault(ERROR_INDEX, at + AT_HEAD.layer, 'TLE-1', `layer ${fields.layer} instead of ${layer}`);
     const attributes = this.attributesOf(layer);
-    const wanted = layer === spec.LAYER_EXTRA ? this.header.extras.length : attributes.length;
+    const column = this.header.extras.find((one) => one.layer === layer);
+    const wanted = column ? 1 : attributes.length;
     if (fields.block_count !== wanted) {
       throw fault(ERROR_STREAM, at + AT_HEAD.block_count, 'TLE-2', `${fields.block_count} blocks instead of ${wanted}`);
     }
     const blocks = [];
     for (const attribute of attributes) blocks.push(this.finish(await this.readBlock(payload, attribute, integers)));
-    const extras = [];
-    if (layer === spec.LAYER_EXTRA) {
-      for (const [column, extra] of this.header.extras.entries()) {
-        const elements = await this.readRaw(payload, column, extra);
-        if (isKnown(extra)) extras.push(elements);
-      }
-    }
+    const extra = column && (await this.readRaw(payload, column));
     payload.finish();
-    return { blocks, extras };
+    return { layer, blocks, extra };
   }
 
   /** @param {number} layer */
@@ -160,26 +154,18 @@ export class Tile {
 
   /**
    * @param {Payload} payload at the block's head
-   * @param {number} column
-   * @param {ExtraRecord} extra record of the column
+   * @param {ExtraRecord} column
    */
-  async readRaw(payload, column, extra) {
+  async readRaw(payload, { components, bytes }) {
     const head = readBlockHead(payload);
     if (head.attribute !== spec.ATTRIBUTE_EXTRA) {
-      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the extra layer`);
+      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the layer of an extra column`);
     }
     checkCoding(head);
-    const { fields, offset } = payload.read(
-      spec.unpackRawParams,
-      spec.RAW_PARAMS_SIZE,
-      spec.RAW_PARAMS_RESERVED,
-      'raw parameters',
-    );
-    if (fields.column !== column)
-      throw fault(ERROR_STREAM, offset, 'RAW-1', `column ${fields.column} instead of ${column}`);
-    const stream = await readStream(payload, this.splatCount, spec.CODING_WIDTH_MAX[spec.CODING_RAW], this.inflate);
-    if (isKnown(extra) && stream.width !== extra.bytes) {
-      const what = `elements of ${stream.width} bytes, the type has ${extra.bytes}`;
+    const widthMax = spec.CODING_WIDTH_MAX[spec.CODING_RAW];
+    const stream = await readStream(payload, components * this.splatCount, widthMax, this.inflate);
+    if (stream.width !== bytes) {
+      const what = `elements of ${stream.width} bytes, the type has ${bytes}`;
       throw fault(ERROR_STREAM, stream.offset, 'RAW-2', what);
     }
     return stream;

@@ -114,6 +114,9 @@ function readCorner(corner, extent, offset) {
   return corner.map(Number); // exact: at most 2^53
 }
 
+/** Return true for the layers of extra columns, whether the file has such a column or not. @param {number} layer */
+const isExtra = (layer) => layer >= spec.LAYER_EXTRA && layer < spec.LAYER_EXTRA + spec.EXTRA_COLUMNS_MAX;
+
 /**
  * @param {Payload} index
  * @param {number} recordSize
@@ -135,13 +138,13 @@ function readLayers(index, recordSize, { level, layer_count: count }, header) {
     );
     const { layer, size, offset, crc } = fields;
     const skipped = layer >= spec.ANCILLARY_ID_MIN;
-    if (!skipped && nameOf(spec.LAYER_NAMES, layer) === undefined)
+    if (!skipped && nameOf(spec.LAYER_NAMES, layer) === undefined && !isExtra(layer))
       throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `layer ${layer}`);
     const before = layers.at(-1)?.layer;
     if (before === undefined ? layer !== spec.LAYER_GEOMETRY : layer <= before) {
       throw fault(ERROR_INDEX, at, 'TIL-2', `layer ${layer} after ${before ?? 'none'}`);
     }
-    if (!skipped && layer !== spec.LAYER_EXTRA && layer > header.shDegree) {
+    if (!skipped && !isExtra(layer) && layer > header.shDegree) {
       throw fault(ERROR_INDEX, at, 'TIL-3', `layer ${layer} in a scene of SH degree ${header.shDegree}`);
     }
     layers.push({
@@ -156,14 +159,11 @@ function readLayers(index, recordSize, { level, layer_count: count }, header) {
     });
   }
   if (count === 0) throw fault(ERROR_INDEX, start, 'TIL-2', 'no layers');
-  const hasExtra = layers.some(({ layer }) => layer === spec.LAYER_EXTRA);
-  if (hasExtra !== (level === 0 && header.extras.length > 0)) {
-    throw fault(
-      ERROR_INDEX,
-      start,
-      'TIL-5',
-      `${header.extras.length} extra columns, ${hasExtra ? 'a' : 'no'} layer of them in a tile of level ${level}`,
-    );
+  const extras = layers.map(({ layer }) => layer).filter(isExtra); // they ascend
+  const wanted = level === 0 ? header.extras.length : 0;
+  if (extras.length !== wanted || extras.some((layer, i) => layer !== spec.LAYER_EXTRA + i)) {
+    const what = `layers ${extras.join(', ') || 'none'} of ${wanted} extra columns of a tile of level ${level}`;
+    throw fault(ERROR_INDEX, start, 'TIL-5', what);
   }
   return layers;
 }

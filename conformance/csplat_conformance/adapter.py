@@ -183,6 +183,7 @@ def _manifest_header(header: Any) -> dict[str, Any]:
         "projection": header.projection,
         "antialiasing": header.antialiasing,
         "colour_space": header.colour_space,
+        "extra_columns": [[column.name, column.semantic] for column in header.extras if column.dtype is not None],
     }
 
 

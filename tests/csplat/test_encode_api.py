@@ -98,12 +98,12 @@ def test_all_metadata_decode(make_model):
     assert (SceneMetadata(**given), (4.5e6, -1e7, 12.25)) == (decoded.metadata, decoded.origin)
 
 
-def test_up_to_255_extra_columns_keep_their_bits_in_any_byte_order(make_model):
+def test_up_to_64_extra_columns_keep_their_bits_in_any_byte_order(make_model):
     columns = {
         dtype: np.frombuffer(np.random.default_rng(0).bytes(20 * np.dtype(dtype).itemsize), dtype)
         for dtype in ("<i4", ">i4", "<f8", ">f8", ">u2", "i1")
     }
-    columns |= {f"c{i}": np.arange(20, dtype=np.uint8) for i in range(249)}
+    columns |= {f"c{i}": np.arange(20, dtype=np.uint8) for i in range(58)}
     model = make_model(20, 0, extra=columns)
     decoded, result = round_trip(model, keep_extra=True)
     assert list(columns) == list(decoded.extra)
@@ -112,8 +112,27 @@ def test_up_to_255_extra_columns_keep_their_bits_in_any_byte_order(make_model):
         assert column.dtype.newbyteorder("<") == kept.dtype
         assert column[result.source_index].tobytes() == kept.astype(column.dtype).tobytes()
     assert {} == dict(round_trip(model)[0].extra)  # dropped by default
-    with pytest.raises(InputError, match="256 extra columns, expected at most 255"):
+    with pytest.raises(InputError, match="65 extra columns, expected at most 64"):
         round_trip(replace(model, extra=columns | {"last": columns["c0"]}), keep_extra=True)
+
+
+def test_extra_columns_of_several_components_and_semantics_decode(make_model):
+    random = np.random.default_rng(1)
+    columns = {
+        "normal": random.normal(size=(30, 3)).astype(np.float32), "most": random.integers(0, 9, (30, 64), np.int16),
+        "one": np.arange(30, dtype=np.uint32), "big": random.normal(size=(30, 2)).astype(">f8"),
+    }  # fmt: skip
+    semantics = {"normal": "normal", "most": "feature:größe", "one": "_mine"}
+    decoded, result = round_trip(make_model(30, 1, extra=columns, semantics=semantics), keep_extra=True)
+    assert semantics == decoded.metadata.semantics
+    for name, column in columns.items():
+        assert np.array_equal(column[result.source_index], decoded.extra[name]), name
+    for wrong, words in (("s" * 57, "0 to 56 bytes"), ("a\nb", "control characters")):
+        with pytest.raises(InputError, match=f"the semantic of extra column 'one' is invalid, expected .*{words}"):
+            round_trip(make_model(30, extra=columns, semantics={"one": wrong}), keep_extra=True)
+    for shape in ((30, 1), (30, 65), (30, 2, 2), (29, 2)):
+        with pytest.raises(InputError, match="extra column 'c' is not an array of 30 values, or of 30 times 2 to 64"):
+            make_model(30, extra={"c": np.zeros(shape)})
 
 
 def test_sh_degree_drops_bands_and_declares_their_error(make_model):

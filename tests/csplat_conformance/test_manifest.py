@@ -222,6 +222,9 @@ def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
         ancillary = {"dtype", "layer", "projection", "antialiasing", "colour_space"}  # ANC-2 to ANC-4
         if rule.field in ancillary:
             values = {value for value in values if value < _spec.ANCILLARY_ID_MIN}
+        if rule.field == "layer":  # those of the extra columns follow that of the first
+            assert set(range(_spec.LAYER_EXTRA, _spec.LAYER_EXTRA + _spec.EXTRA_COLUMNS_MAX)) <= values
+            values = {value for value in values if value <= _spec.LAYER_EXTRA}
         assert set(rule.used) == values
 
     assert [] == failures({title(rule): rule for rule in CHOICES}, check)

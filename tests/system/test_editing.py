@@ -11,7 +11,7 @@ import pytest
 from command_line import call
 from editing_cases import STEPS, box_of, extract, merge
 
-from csplat import EncodeOptions, encode, read_header
+from csplat import EncodeOptions, decode, encode, read_header
 from csplat.ply import read_ply
 
 
@@ -39,16 +39,21 @@ def test_the_command_merges_and_reports(sample, make_model, tmp_path):
         preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
         shape_escape_fraction=0.05, tile_splats=170, keep_extra=True, **STEPS,
     )  # fmt: skip
-    model = replace(sample, extra={"id": np.arange(len(sample), dtype=np.uint32)})
+    facts = replace(sample.metadata, semantics={"normal": "normal"})
+    columns = {"id": np.arange(len(sample), dtype=np.uint32), "normal": np.ones((len(sample), 3), np.float32)}
+    model = replace(sample, extra=columns, metadata=facts)
     halves = [encode(model.select(part), options) for part in np.array_split(np.argsort(sample.means[:, 0]), 2)]
     a, b, c, out = (tmp_path / f"{name}.csplat" for name in ("a", "b", "c", "out"))
     for path, data in zip((a, b, c), [*halves, encode(make_model(40, 3))], strict=True):
         path.write_bytes(data)
     assert "993 splats in 6 tiles, copied: " in call("merge", a, b, "-o", out).stderr
     assert merge(*halves)[1] == out.read_bytes()
+    merged = decode(out)
+    assert (len(sample), {"normal": "normal"}) == (len(np.unique(merged.extra["id"])), merged.metadata.semantics)
+    assert (len(sample), 3) == merged.extra["normal"].shape
     call("merge", a, b, "-o", out, status=1)  # it is there
     assert "is the input" in call("merge", a, b, "-o", a, "--force", status=1).stderr
     again = call("merge", a, c, "-o", out, "--force", "--preset", "fast", "--json")
     assert "decoded and coded again (fast): " in again.stderr
-    assert "left out: id" in again.stderr
+    assert "left out: id, normal" in again.stderr
     assert '"copied": false' in again.stdout

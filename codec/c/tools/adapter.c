@@ -90,6 +90,18 @@ static uint32_t tiles_of(const csplat_info *info)
     return info->tile_count + info->coarse_tile_count;
 }
 
+/* Write a text as a JSON string; it has no control characters. */
+static void put_string(FILE *file, const char *text)
+{
+    fputc('"', file);
+    for (; *text; text++) {
+        if (*text == '"' || *text == '\\')
+            fputc('\\', file);
+        fputc(*text, file);
+    }
+    fputc('"', file);
+}
+
 static void put_header(const csplat_info *info)
 {
     FILE *file = create("header", "");
@@ -99,6 +111,16 @@ static void put_header(const csplat_info *info)
     fprintf(file, "\"scene_flags\": [%s], \"kernel\": \"ellipse\", ", info->flat ? "\"flat\"" : "");
     fprintf(file, "\"projection\": %u, \"antialiasing\": %u, \"colour_space\": %u, ", info->projection, info->antialiasing,
             info->colour_space);
+    fprintf(file, "\"extra_columns\": [");
+    for (uint32_t i = 0, known = 0; i < info->extra_count; i++)
+        if (info->extras[i].bytes) {
+            fprintf(file, known++ ? ", [" : "[");
+            put_string(file, info->extras[i].name);
+            fprintf(file, ", ");
+            put_string(file, info->extras[i].semantic);
+            fputc(']', file);
+        }
+    fprintf(file, "], ");
     if (info->antialiased != (info->antialiasing == 1))
         die("antialiased differs from antialiasing");
     fprintf(file, "\"axes\": \"%s\", \"unit_metres\": %.17g, \"origin\": [%.17g, %.17g, %.17g]}\n", info->axes,
@@ -316,7 +338,7 @@ static int put_all(csplat *file, csplat *other, const csplat_scene *scene)
         put("floats.", "shN", scene->values.shN, 12 * n * (records - 5 + 1) * (records - 5 + 1) - 12 * n);
         for (uint32_t i = 0; i < info->extra_count; i++)
             if (scene->extras[i])
-                put("extra.", info->extras[i].name, scene->extras[i], n * info->extras[i].bytes);
+                put("extra.", info->extras[i].name, scene->extras[i], n * info->extras[i].bytes * info->extras[i].components);
     }
     free(all.opacities);
     free(all.scales);

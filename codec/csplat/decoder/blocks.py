@@ -194,7 +194,7 @@ class TileBlocks:
     Attributes:
         tile: the tile's record.
         blocks: blocks by attribute id.
-        extra: bits of the extra columns of known types, in the order of their records.
+        extra: bits of the known extra columns, [n] or [n, components], in the order of their records.
     """
 
     tile: Tile

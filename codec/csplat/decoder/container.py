@@ -23,6 +23,9 @@ from csplat.file_source import File, describe_substitute, map_file
 #: Flags of a TILE chunk.
 TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 
+#: Layers of extra columns, whether there is one or not.
+EXTRA_LAYERS = range(_spec.LAYER_EXTRA, _spec.LAYER_EXTRA + _spec.EXTRA_COLUMNS_MAX)
+
 #: Name of the highest resource level.
 HIGHEST_LEVEL = _spec.RESOURCE_LEVEL_NAMES[max(_spec.RESOURCE_LEVEL_NAMES)]
 
@@ -36,11 +39,21 @@ class ExtraColumn:
 
     Attributes:
         name: key in `SplatModel.extra`.
-        dtype: NumPy dtype, `<u2`; `None` for a type unknown to this version, whose column is skipped.
+        dtype: NumPy dtype of a value, `<u2`; `None` for a type or a coding unknown to this version: the column is
+            skipped.
+        components: values of a splat.
+        semantic: what the values mean (registry of semantics); "" if that is not stated.
     """
 
     name: str
     dtype: str | None
+    components: int = 1
+    semantic: str = ""
+
+    @property
+    def splat_dtype(self) -> np.dtype[Any]:
+        """The dtype of a splat, with a shape if there are several components; the dtype of the column must be known."""
+        return np.dtype((self.dtype, self.components)) if self.components > 1 else np.dtype(self.dtype)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +151,12 @@ class SceneHeader:
     def antialiased(self) -> bool:
         """True if trained with the mip-splatting low-pass filter."""
         return self.antialiasing == _spec.ANTIALIASING_MIP
+
+    def skips(self, layer: int) -> bool:
+        """Return True if a layer is not decoded: it, or the type or coding of its column, is unknown (ANC-2, ANC-3)."""
+        if layer in EXTRA_LAYERS:
+            return self.extras[layer - EXTRA_LAYERS.start].dtype is None
+        return layer >= _spec.ANCILLARY_ID_MIN
 
     def attribute(self, attribute: int) -> _spec.AttributeRecord:
         """Return an attribute's record; raise `KeyError` for a band above the scene's degree."""

@@ -82,7 +82,7 @@ class DecodedTile:
         opacities: [n] float32.
         sh0: [n, 3] float32.
         shN: [n, K, 3] float32.
-        extra: [n] each, by name.
+        extra: [n] or [n, components] each, by name.
     """
 
     tile: Tile

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 
 from csplat import _spec
 from csplat.decoder.container import (
+    EXTRA_LAYERS,
     ExtraColumn,
     SceneHeader,
     Tile,
@@ -56,6 +57,12 @@ _HINTS: Final = {
     "antialiasing": _spec.ANTIALIASING_NAMES,
     "colour_space": _spec.COLOUR_SPACE_NAMES,
 }
+#: Fields of the record of an extra column with their clauses and ranges.
+_EXTRA_RANGES: Final = (
+    ("components", "EXR-5", 1, _spec.EXTRA_COMPONENTS_MAX),
+    ("name_size", "EXR-1", 1, _spec.EXTRA_NAME_MAX),
+    ("semantic_size", "EXR-7", 0, _spec.EXTRA_SEMANTIC_MAX),
+)
 _SINGLE_CHUNKS = (
     _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS, _spec.CHUNK_TREE,
 )  # fmt: skip
@@ -138,12 +145,14 @@ def parse_header(view: memoryview, *, whole: bool, limits: Limits | None = None)
 
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:
-    """Check the index head at offset `at`: RES-1, RES-2, IDX-3 to IDX-6, IDX-8."""
+    """Check the index head at offset `at`: RES-1, RES-2, IDX-3 to IDX-6, IDX-8, EXR-4."""
     offsets = _spec.INDEX_HEAD_OFFSETS
     check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
             refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
+    if head.extra_count > _spec.EXTRA_COLUMNS_MAX:
+        refuse_field(_spec.ERROR_VALUE, "EXR-4", head, at, offsets, "extra_count", f"at most {_spec.EXTRA_COLUMNS_MAX}")
     if head.kernel not in _spec.KERNEL_NAMES:
         kernel = _spec.KERNEL_RESERVED.get(head.kernel, str(head.kernel)).upper()
         raise UnsupportedError(f"kernel {kernel}", offset=at + offsets["kernel"], clause="RES-2")
@@ -289,33 +298,42 @@ def read_extras(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[Extra
     for i in range(head.extra_count):
         record_at = at + i * head.extra_size
         record = _spec.unpack_extra_record(view, record_at)
+        check_reserved(record, record_at, offsets)
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             raise UnsupportedError(f"type {record.dtype} of an extra column", offset=record_at, clause="RES-2")
-        if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
-            wanted = f"1 to {_spec.EXTRA_NAME_MAX}"
-            refuse_field(_spec.ERROR_VALUE, "EXR-1", record, record_at, offsets, "name_size", wanted)
-        name = _column_name(record, record_at + offsets["name"])
+        if record.coding < _spec.ANCILLARY_ID_MIN and record.coding != _spec.CODING_RAW:
+            subject, coding_at = f"coding {record.coding} of an extra column", record_at + offsets["coding"]
+            raise UnsupportedError(subject, offset=coding_at, clause="EXR-6")
+        for name, clause, least, most in _EXTRA_RANGES:
+            if not least <= getattr(record, name) <= most:
+                refuse_field(_spec.ERROR_VALUE, clause, record, record_at, offsets, name, f"{least} to {most}")
+        name = _column_text(record.name, record.name_size, record_at + offsets["name"], "EXR-2", "name")
+        semantic_at = record_at + offsets["semantic"]
+        semantic = _column_text(record.semantic, record.semantic_size, semantic_at, "EXR-7", "semantic")
         if name in columns:
             raise FormatError(
                 _spec.ERROR_VALUE, record_at + offsets["name"], "EXR-2", f"a second column is named {name!r}"
             )
-        kind = _spec.EXTRA_DTYPE_NAMES.get(record.dtype)
-        columns[name] = ExtraColumn(name, kind and f"<{kind[0]}{_spec.EXTRA_DTYPE_BYTES[record.dtype]}")
+        kind = _spec.EXTRA_DTYPE_NAMES.get(record.dtype) if record.coding == _spec.CODING_RAW else None
+        dtype = kind and f"<{kind[0]}{_spec.EXTRA_DTYPE_BYTES[record.dtype]}"
+        columns[name] = ExtraColumn(name, dtype, record.components, semantic)
     return tuple(columns.values())
 
 
-def _column_name(record: _spec.ExtraRecord, at: int) -> str:
-    """Return the name of an extra column, which begins at offset `at`; check EXR-2 and EXR-3."""
-    raw, rest = record.name[: record.name_size], record.name[record.name_size :]
+def _column_text(field: bytes, size: int, at: int, clause: str, what: str) -> str:
+    """Return the first `size` bytes of the field at offset `at` as text; check that it is UTF-8 without control
+    characters, by `clause`, and EXR-3.
+    """
+    raw, rest = field[:size], field[size:]
     try:
-        name = raw.decode("utf-8")
+        text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise FormatError(_spec.ERROR_VALUE, at + error.start, "EXR-2", "name is not UTF-8") from None
-    if not _CONTROL.isdisjoint(name):
-        raise FormatError(_spec.ERROR_VALUE, at, "EXR-2", f"control character in the name {name!r}")
+        raise FormatError(_spec.ERROR_VALUE, at + error.start, clause, f"{what} is not UTF-8") from None
+    if not _CONTROL.isdisjoint(text):
+        raise FormatError(_spec.ERROR_VALUE, at, clause, f"control character in the {what} {text!r}")
     if any(rest):
-        raise FormatError(_spec.ERROR_RESERVED, at + len(raw), "EXR-3", "bytes after the name are not 0")
-    return name
+        raise FormatError(_spec.ERROR_RESERVED, at + size, "EXR-3", f"bytes after the {what} are not 0")
+    return text
 
 
 def read_directory(view: memoryview, at: range) -> tuple[_spec.DirectoryRecord, ...]:
@@ -531,7 +549,8 @@ def _read_layers(
         check_reserved(record, record_at, offsets)
         if record.layer <= last or (i == 0 and record.layer != _spec.LAYER_GEOMETRY):
             refuse_field(_spec.ERROR_INDEX, "TIL-2", record, record_at, offsets, "layer", "0, then ascending")
-        if record.layer < _spec.ANCILLARY_ID_MIN and record.layer not in _spec.LAYER_NAMES:
+        known = record.layer in _spec.LAYER_NAMES or record.layer in EXTRA_LAYERS
+        if record.layer < _spec.ANCILLARY_ID_MIN and not known:
             raise UnsupportedError(f"layer {record.layer}", offset=record_at, clause="RES-2")
         if head.sh_degree < record.layer <= _spec.SH_DEGREE_MAX:
             refuse_field(_spec.ERROR_INDEX, "TIL-3", record, record_at, offsets, "layer", f"at most {head.sh_degree}")
@@ -540,8 +559,9 @@ def _read_layers(
         layers[last] = record
     if not layers:
         raise FormatError(_spec.ERROR_INDEX, at, "TIL-2", "a tile without layers", wanted="layer 0")
-    if (_spec.LAYER_EXTRA in layers) != (head.extra_count > 0 and tile.level == 0):
-        detail = f"layer EXTRA at level {tile.level} for {head.extra_count} extra columns"
+    columns = range(_spec.LAYER_EXTRA, _spec.LAYER_EXTRA + (0 if tile.level else head.extra_count))
+    if [layer for layer in layers if layer in EXTRA_LAYERS] != [*columns]:
+        detail = f"layers of extra columns at level {tile.level}, of which the file has {head.extra_count}"
         raise FormatError(_spec.ERROR_INDEX, at, "TIL-5", detail, found=[*layers])
     return layers
 

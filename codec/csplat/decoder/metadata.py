@@ -92,6 +92,7 @@ def scene_metadata(view: memoryview, header: SceneHeader, limits: Limits) -> Sce
         colour_space=_spec.COLOUR_SPACE_NAMES.get(header.colour_space, str(header.colour_space)),
         entries=json_chunk(view, header, _spec.CHUNK_METADATA, limits.json_bytes) or {},
         cameras=json_chunk(view, header, _spec.CHUNK_CAMERAS, limits.json_bytes),
+        semantics={column.name: column.semantic for column in header.extras if column.semantic},
     )
 
 

@@ -48,7 +48,7 @@ class SplatArrays:
         opacities: [N].
         sh0: [N, 3].
         shN: [N, K, 3].
-        extra: [N] each, by name.
+        extra: [N] or [N, components] each, by name.
     """
 
     means: F32
@@ -69,7 +69,7 @@ class SplatArrays:
             opacities=np.empty(count, np.float32),
             sh0=np.empty((count, 3), np.float32),
             shN=np.empty((count, (sh_degree + 1) ** 2 - 1, 3), np.float32),
-            extra={column.name: np.empty(count, column.dtype) for column in header.extras if column.dtype},
+            extra={column.name: np.empty(count, column.splat_dtype) for column in header.extras if column.dtype},
         )
 
     def part(self, start: int, stop: int) -> SplatArrays:

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from csplat import _spec
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.errors import FormatError
@@ -24,7 +22,7 @@ def float_bytes(header: SceneHeader, degree: int, *, extras: bool = True) -> int
     """Return the bytes per splat in the arrays of spec 3, with or without extra columns."""
     floats = 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
     columns = header.extras if extras else ()
-    return 4 * floats + sum(np.dtype(column.dtype).itemsize for column in columns if column.dtype)
+    return 4 * floats + sum(column.splat_dtype.itemsize for column in columns if column.dtype)
 
 
 def check_resource_level(header: SceneHeader, coarsest: Sequence[Tile] | None) -> None:

@@ -28,7 +28,17 @@ from csplat.decoder.blocks import (
     read_signed,
 )
 from csplat.decoder.codebooks import attribute_columns
-from csplat.decoder.container import TILE_FLAGS, Cursor, SceneHeader, Tile, check_reserved, open_chunk, refuse_field
+from csplat.decoder.container import (
+    EXTRA_LAYERS,
+    TILE_FLAGS,
+    Cursor,
+    ExtraColumn,
+    SceneHeader,
+    Tile,
+    check_reserved,
+    open_chunk,
+    refuse_field,
+)
 from csplat.decoder.entropy import Ints, read_stream
 from csplat.errors import FormatError
 
@@ -73,29 +83,21 @@ def wanted_layers(tile: Tile, degree: int) -> list[_spec.LayerRecord]:
 def read_tile(
     view: memoryview, header: SceneHeader, tile: Tile, degree: int, books: Mapping[int, Codebook]
 ) -> TileBlocks:
-    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; check the frames of unknown layers."""
+    """Read layer 0, the SH layers up to `degree` and the extra columns of a tile; check frames of unknown layers."""
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
     for layer in wanted_layers(tile, degree):
         cursor = open_chunk(view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-3")
-        if layer.layer not in _spec.LAYER_NAMES:
-            continue  # ANC-2
-        if layer.layer == _spec.LAYER_EXTRA:
-            wanted = [_spec.ATTRIBUTE_EXTRA] * len(header.extras)
-        else:
-            wanted = [
-                record.attribute
-                for record in header.attributes
-                if _spec.ATTRIBUTE_LAYER[record.attribute] == layer.layer
-            ]
-        _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), layer.layer, len(wanted))
-        for index, attribute in enumerate(wanted):
-            if attribute == _spec.ATTRIBUTE_EXTRA:
-                bits = read_raw(cursor, context, index)
-                if header.extras[index].dtype:
-                    result.extra.append(bits)
-            else:
-                result.blocks[attribute] = read_block(cursor, context, attribute)
+        if header.skips(layer.layer):
+            continue
+        is_extra = layer.layer in EXTRA_LAYERS
+        wanted = [r.attribute for r in header.attributes if _spec.ATTRIBUTE_LAYER[r.attribute] == layer.layer]
+        _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), layer.layer, 1 if is_extra else len(wanted))
+        if is_extra:
+            column = header.extras[layer.layer - EXTRA_LAYERS.start]
+            result.extra.append(read_raw(cursor, tile.splat_count, column))
+        for attribute in wanted:
+            result.blocks[attribute] = read_block(cursor, context, attribute)
         cursor.finish()
     return result
 
@@ -134,7 +136,7 @@ def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> 
     check_reserved(head, at, offsets)
     if head.layer != layer:
         refuse_field(_spec.ERROR_INDEX, "TLE-1", head, at, offsets, "layer", layer)
-    if head.block_count != block_count:  # always the case for more than 255 extra columns: the count is a single byte
+    if head.block_count != block_count:
         refuse_field(_spec.ERROR_STREAM, "TLE-2", head, at, offsets, "block_count", block_count)
 
 
@@ -172,20 +174,19 @@ def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> SparseB
     return SparseBlock(read_signed(cursor, record, params.exponent, len(present)), present)
 
 
-def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
-    """Read the block of an extra column; return the bits of its values, unsigned integers [n]."""
+def read_raw(cursor: Cursor, count: int, column: ExtraColumn) -> Ints:
+    """Read the block of an extra column of `count` splats; return the bits of its values as unsigned integers.
+
+    Returns:
+        [count], or [count, components] if there are several.
+    """
     coding = read_block_head(cursor, _spec.ATTRIBUTE_EXTRA)
-    at = cursor.take(_spec.RAW_PARAMS_SIZE)
-    params = _spec.unpack_raw_params(cursor.view, at)
-    check_reserved(params, at, _spec.RAW_PARAMS_OFFSETS)
-    if params.column != column:
-        refuse_field(_spec.ERROR_STREAM, "RAW-1", params, at, _spec.RAW_PARAMS_OFFSETS, "column", column)
     width_at = cursor.at
-    elements = read_stream(cursor, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
-    width, dtype = cursor.view[width_at], context.header.extras[column].dtype
-    if dtype and width != (wanted := np.dtype(dtype).itemsize):
+    elements = read_stream(cursor, count * column.components, _spec.CODING_WIDTH_MAX[coding])
+    width, wanted = cursor.view[width_at], np.dtype(column.dtype).itemsize
+    if width != wanted:
         raise FormatError(_spec.ERROR_STREAM, width_at, "RAW-2", "width", found=width, wanted=wanted)
-    return elements
+    return elements if column.components == 1 else elements.reshape(column.components, count).T
 
 
 def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock:

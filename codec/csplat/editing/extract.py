@@ -13,7 +13,7 @@ from typing import Any
 
 from csplat import _spec
 from csplat.byte_store import FileWindow
-from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk
+from csplat.decoder.container import EXTRA_LAYERS, TILE_FLAGS, SceneHeader, Tile, open_chunk
 from csplat.decoder.tree import Node
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder.container import (
@@ -201,7 +201,7 @@ class TileCopier:
     def __init__(self, window: FileWindow, files: int = 1) -> None:
         self._window = window
         self._files = files
-        self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
+        self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in {*_spec.LAYER_NAMES, *EXTRA_LAYERS}}
 
     def of(self, tile: Tile, changed: Mapping[int, LazyPayload] | None = None) -> FileTile:
         """Return a tile for the new file, without layers of unknown ids.
@@ -211,7 +211,7 @@ class TileCopier:
             changed: replaced payloads by layer.
         """
         layers: dict[int, Payload] = dict(changed or {})
-        for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
+        for layer in self._records.keys() & tile.layers.keys() - layers.keys():
             record, records = tile.layers[layer], self._records[layer]
             read = partial(self._read, layer, len(records))
             layers[layer] = LazyPayload(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)

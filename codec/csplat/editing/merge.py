@@ -317,9 +317,10 @@ def _merge_scenes(scenes: Sequence[SplatFile]) -> Scene:
             colour_space=scenes[0].metadata.colour_space,
             cameras=_common_cameras(scenes),
             entries=_common_entries([scene.metadata.entries for scene in scenes]),
+            semantics=scenes[0].metadata.semantics,
         ),
         extra={
-            column.name: np.dtype(column.dtype)
+            column.name: column.splat_dtype
             for column in headers[0].extras
             if column.dtype is not None and all(column in header.extras for header in headers)
         },

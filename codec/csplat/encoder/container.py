@@ -219,7 +219,7 @@ def _ordered_chunks(
     last = [chunk for chunk in others if tree and chunk.type in _LAST]
     yield from ((None, chunk) for chunk in (*tree, *others) if chunk not in last)
     coarsest_first = sorted(enumerate(tiles), key=lambda item: -item[1].level)
-    for layer in _spec.LAYER_NAMES:
+    for layer in sorted({*_spec.LAYER_NAMES, *(layer for tile in tiles for layer in tile.layers)}):
         for chunk in scene.chunks:
             if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer == layer:
                 yield None, chunk
@@ -322,10 +322,15 @@ def _index(
     return index + zlib.crc32(index).to_bytes(_CRC_SIZE, "little")
 
 
+def _extra_bytes(column: _spec.ExtraRecord) -> int:
+    """Return the bytes of a splat in an extra column, 0 if its type or coding is unknown."""
+    return column.components * _spec.EXTRA_DTYPE_BYTES.get(column.dtype, 0) * (column.coding == _spec.CODING_RAW)
+
+
 def _resource_level(scene: SceneFields, tiles: Sequence[FileTile], index_size: int) -> int:
     """Return the lowest resource level whose bounds the contents obey (spec 8.1); `index_size` is in bytes."""
     splat_bytes = 4 * (3 + 4 + 3 + 1 + 3 * (scene.sh_degree + 1) ** 2)
-    extra_bytes = sum(_spec.EXTRA_DTYPE_BYTES.get(extra.dtype, 0) for extra in scene.extras)
+    extra_bytes = sum(_extra_bytes(extra) for extra in scene.extras)
     sizes = [tile.splat_count * (splat_bytes + extra_bytes * (tile.level == 0)) for tile in tiles]
     coarsest = _coarsest_tiles(scene, tiles)
     version = sum(tile.splat_count for tile in coarsest) * splat_bytes

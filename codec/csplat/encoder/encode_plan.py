@@ -43,8 +43,6 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.types import I64
 
-_EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
-
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -243,16 +241,35 @@ def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     records: list[_spec.ExtraRecord] = []
     if not options.keep_extra:
         return records
-    if len(model.extra) > _EXTRA_COLUMNS_MAX:
-        raise InputError(f"the model has {len(model.extra)} extra columns, expected at most {_EXTRA_COLUMNS_MAX}")
+    if len(model.extra) > _spec.EXTRA_COLUMNS_MAX:
+        raise InputError(f"the model has {len(model.extra)} extra columns, expected at most {_spec.EXTRA_COLUMNS_MAX}")
     ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
     for name, column in model.extra.items():
-        text = name.encode()
         kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}"
         if kind not in ids:
             raise InputError(f"extra column {name!r} has dtype {column.dtype}, expected one of {', '.join(ids)}")
-        if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):
-            limits = f"1 to {_spec.EXTRA_NAME_MAX} bytes without control characters"
-            raise InputError(f"the name of extra column {name!r} is invalid, expected {limits}")
-        records.append(_spec.ExtraRecord(ids[kind], len(text), text.ljust(_spec.EXTRA_NAME_MAX, b"\0")))
+        text = _record_text(name, f"the name of extra column {name!r}", 1, _spec.EXTRA_NAME_MAX)
+        semantic = model.metadata.semantics.get(name, "")
+        meaning = _record_text(semantic, f"the semantic of extra column {name!r}", 0, _spec.EXTRA_SEMANTIC_MAX)
+        records.append(
+            _spec.ExtraRecord(
+                dtype=ids[kind],
+                components=column.shape[1] if column.ndim > 1 else 1,
+                coding=_spec.CODING_RAW,
+                name_size=len(text),
+                semantic_size=len(meaning),
+                reserved_0=0,
+                reserved_1=0,
+                name=text.ljust(_spec.EXTRA_NAME_MAX, b"\0"),
+                semantic=meaning.ljust(_spec.EXTRA_SEMANTIC_MAX, b"\0"),
+            )
+        )
     return records
+
+
+def _record_text(text: str, subject: str, least: int, most: int) -> bytes:
+    """Return a text of `least` to `most` bytes in UTF-8; raise an `InputError` about `subject` if it is another."""
+    encoded = text.encode()
+    if not least <= len(encoded) <= most or any(ord(c) < 32 or ord(c) == 127 for c in text):
+        raise InputError(f"{subject} is invalid, expected {least} to {most} bytes without control characters")
+    return encoded

@@ -215,12 +215,11 @@ def codebook_block(
     return _block_head(attribute, _spec.CODING_CODEBOOK) + params + streams + escape
 
 
-def raw_block(column: int, values: NDArray[Any], deflate: DeflateSettings) -> bytes:
-    """Return a RAW block of the values [n] of an extra column."""
-    bits = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
-    params = _spec.pack_raw_params(_spec.RawParams(column, 0))
-    stream = unsigned_stream(bits, deflate, fixed_width=values.itemsize)
-    return _block_head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + params + stream
+def raw_block(values: NDArray[Any], deflate: DeflateSettings) -> bytes:
+    """Return a RAW block of the values [n] or [n, components] of an extra column."""
+    bits = np.ascontiguousarray(values.T, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
+    stream = unsigned_stream(bits.ravel(), deflate, fixed_width=values.itemsize)
+    return _block_head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + stream
 
 
 def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:

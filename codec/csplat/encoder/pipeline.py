@@ -231,7 +231,7 @@ class EncodedTiles:
         tiles = [
             replace(
                 tile, level=0,
-                layers={layer: payload for layer, payload in tile.layers.items() if layer != _spec.LAYER_EXTRA},
+                layers={layer: payload for layer, payload in tile.layers.items() if layer < _spec.LAYER_EXTRA},
             )
             for node in nodes
             for tile in node.tiles
@@ -353,11 +353,8 @@ def encode_tile(
             result.coarsened.add("shN")
         for measure, pair in errors.items():
             result.add_errors(measure, pair)
-    if sh_plan.extras:
-        layers[_spec.LAYER_EXTRA] = [
-            entropy.raw_block(column, splats.extra[name], parameters.deflate)
-            for column, name in enumerate(sh_plan.extras)
-        ]
+    for layer, name in enumerate(sh_plan.extras, _spec.LAYER_EXTRA):
+        layers[layer] = [entropy.raw_block(splats.extra[name], parameters.deflate)]
     corner, extent = quantised.corner, quantised.q.max(axis=1)
     file_tile = FileTile(
         splat_count=len(rows),

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
+from csplat import _spec
 from csplat.errors import counted
 from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE
@@ -25,6 +28,8 @@ _OPACITY = "opacity"
 _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 _REST_DIGITS = 9  # digits of its number that are compared; no valid file has a longer number
+#: A column of several, `NAME_12`.
+_NUMBERED = re.compile(r"(.+)_(0|[1-9][0-9]{0,6})")
 _ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
 
 #: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the second prefix that 3dgsconverter adds to files for
@@ -56,7 +61,7 @@ class ColumnMap:
         rest: 3 K names, channel by channel: red, green, blue.
         opacity: name of the column of logits.
         normals: three names, or none.
-        extra: names of all other columns.
+        extra: all other columns of the file, by the name of the extra column that they form, see `group_columns`.
         double: True if positions have more precision than float32.
         colour_range: the value of white if `sh0` are red, green and blue; 0 if they are coefficients.
         filter_3d: name of the column with the standard deviations of Mip-Splatting's 3D filter; "" if absent.
@@ -69,7 +74,7 @@ class ColumnMap:
     rest: tuple[str, ...]
     opacity: str
     normals: tuple[str, ...]
-    extra: tuple[str, ...]
+    extra: Mapping[str, tuple[str, ...]]
     double: bool
     colour_range: float = 0.0
     filter_3d: str = ""
@@ -135,9 +140,9 @@ def find_columns(
 
     usual = (*means, *normals, *sh0, *every, *opacity, *scales, *quats)
     known = set(usual)
-    extra = tuple(name for name in names.all if name not in known and name != filter_3d)
-    if extra and not keep_extra:
-        findings.append(dropped_columns(extra))
+    others = [name for name in names.all if name not in known and name != filter_3d]
+    if others and not keep_extra:
+        findings.append(dropped_columns(others))
     in_file = tuple(name for name in names.all if name in known)
     if in_file != usual:
         moved = sum(have != want for have, want in zip(in_file, usual, strict=True))
@@ -145,9 +150,59 @@ def find_columns(
         findings.append(Finding("shuffled-columns", moved, text, "note"))
     double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in means)
     columns = ColumnMap(
-        means, scales, quats, sh0, rest, opacity[0], normals, extra, double, colour_range, filter_3d
+        means, scales, quats, sh0, rest, opacity[0], normals, group_columns(dtype, others), double, colour_range,
+        filter_3d,
     )  # fmt: skip
     return columns, findings
+
+
+def group_columns(dtype: np.dtype[Any], names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Group columns of one type with the names `NAME_0`, `NAME_1` and so on into an extra column NAME.
+
+    An extra column has at most `EXTRA_COMPONENTS_MAX` components. The next ones form the column `NAME_64`, and so on.
+
+    Args:
+        dtype: structured, a field per column.
+        names: the columns to group.
+
+    Returns:
+        Names of the columns by the name of the extra column, in the order of the file. `property_names` reverses it.
+    """
+    groups: dict[str, tuple[str, ...]] = {}
+    grouped: set[str] = set()
+    types = {name: dtype[name] for name in names}
+    most = _spec.EXTRA_COMPONENTS_MAX
+    for name in names:
+        if name in grouped:
+            continue
+        match = _NUMBERED.fullmatch(name)
+        group: tuple[str, ...] = (name,)
+        if match is not None and int(match[2]) % most == 0 and match[1] not in types:
+            first = int(match[2])
+            run = (f"{match[1]}_{number}" for number in range(first, first + most))
+            group = tuple(takewhile(partial(_is_alike, types, name), run))
+        key = match[1] if match is not None and len(group) > 1 and match[2] == "0" else name
+        groups[key] = group
+        grouped.update(group)
+    return groups
+
+
+def _is_alike(types: Mapping[str, np.dtype[Any]], name: str, other: str) -> bool:
+    """Return True if two columns exist and have the same type."""
+    return other in types and types[name] == types[other]  # a dtype of doubles equals None
+
+
+def property_names(name: str, components: int) -> list[str]:
+    """Return the columns of a PLY that hold an extra column, one for each component."""
+    if components == 1:
+        return [name]
+    match = _NUMBERED.fullmatch(name)
+    first = int(match[2]) if match is not None else 0
+    if match is not None and first and first % _spec.EXTRA_COMPONENTS_MAX == 0:
+        name = match[1]
+    else:
+        first = 0
+    return [f"{name}_{number}" for number in range(first, first + components)]
 
 
 def _sphere_column(names: _NameIndex, scales: Sequence[str]) -> str:

@@ -166,7 +166,7 @@ def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStat
         statistics: updated.
     """
     statistics.has_columns = False
-    columns = ColumnMap((), ("",) * scale_count, (), (), (), "", (), (), double=False)
+    columns = ColumnMap((), ("",) * scale_count, (), (), (), "", (), {}, double=False)
     for start in range(0, len(arrays.means), _SAMPLE_ROWS):
         part = _slice_arrays(arrays, slice(start, start + _SAMPLE_ROWS))
         copies = {name: array.copy() for name, array in vars(part).items() if name != "extra"}
@@ -292,7 +292,7 @@ def logits_of_alpha(alpha: F32) -> F32:
 
 def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extra: bool) -> AttributeArrays:
     """Return uninitialised arrays for `count` splats; extra columns have the byte order of the machine."""
-    extra = columns.extra if keep_extra else ()
+    extra = columns.extra if keep_extra else {}
     return AttributeArrays(
         means=np.empty((count, 3), np.float64 if columns.double else np.float32),
         quats=np.empty((count, 4), np.float32),
@@ -300,7 +300,10 @@ def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extr
         opacities=np.empty(count, np.float32),
         sh0=np.empty((count, 3), np.float32),
         shN=np.empty((count, len(columns.rest) // 3, 3), np.float32),
-        extra={name: np.empty(count, dtype[name].newbyteorder("=")) for name in extra},
+        extra={
+            name: np.empty((count, len(group)) if len(group) > 1 else count, dtype[group[0]].newbyteorder("="))
+            for name, group in extra.items()
+        },
     )
 
 
@@ -366,7 +369,7 @@ def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
         names = columns.rest[channel * coefficients : (channel + 1) * coefficients]
         _copy_group(rows, names, part.shN[:, :, channel])
     for name, column in part.extra.items():
-        column[:] = rows[name]
+        _copy_group(rows, columns.extra[name], column.reshape(len(rows), -1))
 
 
 def _copy_group(rows: Rows, names: Sequence[str], target: NDArray[Any]) -> None:

@@ -9,6 +9,7 @@
 | `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SceneMetadata` |
 | `csplat estimated KEY ...` | entries that are estimates: `up` |
 | `csplat colour_space NAME` | as in `SceneMetadata`; absent for sRGB |
+| `csplat semantic NAME SEMANTIC` | what an extra column means; absent if its name says so |
 | `csplat training {JSON}`, `csplat view {JSON}` | the training (`TrainingRecord`) and the initial view |
 | `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
 """
@@ -43,6 +44,7 @@ from csplat.scene_metadata import (
 from csplat.types import F32, F64
 
 _PREFIX = "csplat"
+_SEMANTIC = "semantic"
 _SHOWN = 80  # maximum number of characters of a comment in a message
 #: nerfstudio's ns-export names the axis that points up. Brush writes the same axis for every scene, so its comment is
 #: ignored.
@@ -135,6 +137,8 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
         lines.append(f"{_PREFIX} unit_metres {metadata.unit_metres!r}")
     if metadata.colour_space != SRGB:
         lines.append(f"{_PREFIX} colour_space {metadata.colour_space}")
+    named = ((name, semantic) for name, semantic in metadata.semantics.items() if name != semantic)
+    lines += [f"{_PREFIX} {_SEMANTIC} {name} {semantic}" for name, semantic in named]
     if metadata.flat:
         lines.append("SplatRenderMode: 2dgs")
     if metadata.antialiased:
@@ -215,6 +219,8 @@ def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values
         (fields[key],) = _parse_numbers(key, values, 1)
     elif key in ("antialiased", "flat") and not values:
         fields[key] = True
+    elif key == _SEMANTIC and len(values) == 2:
+        fields.setdefault("semantics", {})[values[0]] = values[1]
     elif key == ESTIMATED and values:
         entries[ESTIMATED] = list(values)
     elif key == LICENCE and values:

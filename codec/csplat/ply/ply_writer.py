@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
+from csplat.ply.column_names import property_names
 from csplat.ply.columns import logits_of_alpha
 from csplat.ply.comments import format_comments
 from csplat.scene import Scene
@@ -82,7 +84,7 @@ def _row_dtype(scene: Scene, *, absolute: bool) -> np.dtype[Any]:
             ("logits", "<f4"),
             ("scales", "<f4", 3),
             ("quats", "<f4", 4),
-            *((f"extra {name}", dtype.newbyteorder("<")) for name, dtype in scene.extra.items()),
+            *((f"extra {name}", dtype.base.newbyteorder("<"), dtype.shape) for name, dtype in scene.extra.items()),
         ]
     )
 
@@ -98,10 +100,14 @@ def _build_header(scene: Scene, *, absolute: bool) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {scene.count}"]
     lines += [f"property {position} {name}" for name in ("x", "y", "z")]
     lines += [f"property float {name}" for name in floats]
-    for name, dtype in scene.extra.items():
-        if name in {"x", "y", "z", *floats}:
-            raise InputError(f"extra column {name!r} has the name of a splat attribute in a PLY")
-        lines.append(f"property {_ply_type(name, dtype)} {name}")
+    taken = {"x", "y", "z", *floats}
+    for column, dtype in scene.extra.items():
+        kind = _ply_type(column, dtype.base)
+        for name in property_names(column, math.prod(dtype.shape)):
+            if name in taken:
+                raise InputError(f"extra column {column!r}: the PLY has a column {name!r} already")
+            taken.add(name)
+            lines.append(f"property {kind} {name}")
     lines += [f"comment {line}" for line in format_comments(scene.metadata, scene.origin, absolute=absolute)]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")
 

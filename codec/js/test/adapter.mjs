@@ -65,6 +65,7 @@ async function decoded(bytes, limits = {}) {
     projection: header.projection,
     antialiasing: header.antialiasing,
     colour_space: header.colourSpace,
+    extra_columns: header.extras.filter(({ dtype }) => dtype).map(({ name, semantic }) => [name, semantic]),
     axes: header.axes,
     unit_metres: header.unitMetres,
     origin: header.origin,

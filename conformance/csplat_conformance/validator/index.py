@@ -52,7 +52,7 @@ class Index:
         levels: levels that obey ATT-3 or ATT-4, by registry value.
         codebooks: codebook records with valid kind and sizes, by id.
         codebook_ids: ids of all codebook records.
-        extras: bytes per value of each extra column, `None` if the type is unknown.
+        extras: bytes per value and number of components of each extra column, `None` if type or coding is unknown.
         complete: whether all records read so far fit into the index.
         end: offset of the end of these records.
     """
@@ -64,7 +64,7 @@ class Index:
     levels: dict[int, int] = field(default_factory=dict)
     codebooks: dict[int, CodebookAt] = field(default_factory=dict)
     codebook_ids: set[int] = field(default_factory=set)
-    extras: list[int | None] = field(default_factory=list)
+    extras: list[tuple[int, int] | None] = field(default_factory=list)
     complete: bool = True
     end: int = 0
 
@@ -128,13 +128,15 @@ def _count_fitting_records(index: Index, at: int, end: int, count: int, size: in
 
 
 def _check_head(log: ViolationLog, head: Head) -> None:
-    """Check the index head: RES-1, RES-2, IDX-3 to IDX-6, IDX-8."""
+    """Check the index head: RES-1, RES-2, IDX-3 to IDX-6, IDX-8, EXR-4."""
     record = head.record
     log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
             log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
+    if record.extra_count > _spec.EXTRA_COLUMNS_MAX:
+        log.add_field("EXR-4", head, "extra_count", f"{record.extra_count}, expected at most {_spec.EXTRA_COLUMNS_MAX}")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
         log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
     if record.kernel not in _spec.KERNEL_NAMES:
@@ -287,47 +289,65 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
 
 
 def _read_extras(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
-    """Read the extra column records from `at` on, check RES-2 and EXR-1 to EXR-3, and return the end offset.
+    """Read the extra column records from `at` on and return the end offset; check RES-1, RES-2 and EXR, except EXR-4.
 
-    Adds the bytes per value of each column to `index.extras`, `None` for unknown types.
+    Adds the bytes per value and the components of each column to `index.extras`, `None` for unknown types and codings.
     """
     names: set[str] = set()
     for i in range(_count_fitting_records(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
         placed = read_record(view, _spec.ExtraRecord, at, f"extra[{i}]")
         record = placed.record
+        log.check_reserved(placed)
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             log.add_field("RES-2", placed, "dtype", f"{record.dtype} is not in the registry")
+        if record.coding < _spec.ANCILLARY_ID_MIN and record.coding != _spec.CODING_RAW:
+            log.add_field("EXR-6", placed, "coding", f"{record.coding}, expected {_spec.CODING_RAW}")
+        if not 1 <= record.components <= _spec.EXTRA_COMPONENTS_MAX:
+            message = f"{record.components}, expected 1 to {_spec.EXTRA_COMPONENTS_MAX}"
+            log.add_field("EXR-5", placed, "components", message)
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
             log.add_field("EXR-1", placed, "name_size", f"{record.name_size}, expected 1 to {_spec.EXTRA_NAME_MAX}")
         else:
-            _check_name(log, placed, names)
-        index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
+            name = _check_text(log, placed, "name", record.name_size, "EXR-2")
+            if name in names:
+                log.add_field("EXR-2", placed, "name", f"a second column is named {name!r}")
+            names |= set() if name is None else {name}
+        if record.semantic_size > _spec.EXTRA_SEMANTIC_MAX:
+            message = f"{record.semantic_size}, expected at most {_spec.EXTRA_SEMANTIC_MAX}"
+            log.add_field("EXR-7", placed, "semantic_size", message)
+        else:
+            _check_text(log, placed, "semantic", record.semantic_size, "EXR-7")
+        size = _spec.EXTRA_DTYPE_BYTES.get(record.dtype) if record.coding == _spec.CODING_RAW else None
+        index.extras.append(None if size is None else (size, record.components))
         at += index.size_of("extra")
     return at
 
 
-def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
-    """Check EXR-2 and EXR-3, and add the name to `names`, the names of the preceding columns."""
-    raw, padding = placed.record.name[: placed.record.name_size], placed.record.name[placed.record.name_size :]
-    if any(padding):
-        log.add_field("EXR-3", placed, "name", "bytes after the name are not 0", within=len(raw))
+def _check_text(
+    log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], field_name: str, size: int, clause: str
+) -> str | None:
+    """Check EXR-3, and by `clause` that the first `size` bytes are a text, which is returned, `None` if not UTF-8."""
+    data: bytes = getattr(placed.record, field_name)
+    if any(data[size:]):
+        log.add_field("EXR-3", placed, field_name, f"bytes after the {field_name} are not 0", within=size)
     try:
-        name = raw.decode("utf-8")
+        text = data[:size].decode("utf-8")
     except UnicodeDecodeError as error:
-        log.add_field("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
-        return
-    if any(ord(character) < 0x20 or ord(character) == 0x7F for character in name):
-        log.add_field("EXR-2", placed, "name", f"a control character in {name!r}")
-    if name in names:
-        log.add_field("EXR-2", placed, "name", f"a second column is named {name!r}")
-    names.add(name)
+        log.add_field(clause, placed, field_name, f"byte {error.start} is not UTF-8", within=error.start)
+        return None
+    if any(ord(character) < 0x20 or ord(character) == 0x7F for character in text):
+        log.add_field(clause, placed, field_name, f"a control character in {text!r}")
+    return text
 
 
 #: Chunks that 4.3.6 recommends at the end of a file with levels.
 _LAST_CHUNKS = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, *_LAST_CHUNKS, _spec.CHUNK_TREE)
 #: The first number after the layers of this version; the order of later layers is not checked (4.3.6).
-_LAYER_END = max(_spec.LAYER_NAMES) + 1
+_LAYER_END = _spec.LAYER_EXTRA + _spec.EXTRA_COLUMNS_MAX
+
+
+KNOWN_LAYERS = {*_spec.LAYER_NAMES, *range(_spec.LAYER_EXTRA, _LAYER_END)}
 
 
 @dataclass
@@ -680,7 +700,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
             log.add_field("TIL-2", placed, "layer", f"the first is {layer}, expected {_spec.LAYER_GEOMETRY}")
         elif layer <= last:
             log.add_field("TIL-2", placed, "layer", f"{layer} after {last}, expected ascending layers")
-        if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
+        if layer < _spec.ANCILLARY_ID_MIN and layer not in KNOWN_LAYERS:
             log.add_field("RES-2", placed, "layer", f"{layer} is not a layer of this version")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
             log.add_field("TIL-3", placed, "layer", f"band {layer}, expected at most sh_degree, {index.degree}")
@@ -691,10 +711,10 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
     if not tile.chunks:
         log.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, expected layer 0")
         return  # TIL-5 follows from this
-    has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
-    if has_extra != (tile.level == 0 and index.head.record.extra_count > 0):
-        verb, extras = "has" if has_extra else "lacks", index.head.record.extra_count
-        message = f"a tile of level {tile.level} that {verb} the extra layer; the scene has {extras} extra columns"
+    extras = index.head.record.extra_count
+    found = {chunk.layer for chunk in tile.chunks if _spec.LAYER_EXTRA <= chunk.layer < _LAYER_END}
+    if found != set(range(_spec.LAYER_EXTRA, _spec.LAYER_EXTRA + (0 if tile.level else extras))):
+        message = f"a tile of level {tile.level} with the layers {sorted(found)}; the scene has {extras} extra columns"
         log.add("TIL-5", start, f"{tile.record.name}.layer", message)
 
 

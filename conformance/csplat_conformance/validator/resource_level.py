@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from csplat import _spec
@@ -34,7 +35,7 @@ def check_resource_level(
     found = header.record.resource_level
     if found not in _spec.RESOURCE_LEVEL_NAMES or index.degree is None:
         return
-    extra_bytes = sum(size or 0 for size in index.extras)
+    extra_bytes = sum(math.prod(column) for column in index.extras if column is not None)
     floats = 11 + 3 * (index.degree + 1) ** 2
     columns = [
         book.record.size * (sum(3 * (2 * band + 1) for band in range(first, last + 1)) if first else _SHAPE_COLUMNS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.index import Chunk, CodebookAt, Index, Tile, scaled_step
+from csplat_conformance.validator.index import KNOWN_LAYERS, Chunk, CodebookAt, Index, Tile, scaled_step
 from csplat_conformance.validator.streams import Elements, read_stream
 from csplat_conformance.validator.values import Place, check_box, check_integers, check_max_scale
 from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
@@ -69,12 +69,13 @@ class TileChecker:
             UnreadableError: the structure of the remaining bytes is unknown.
         """
         log = self.log
-        if chunk.layer >= _spec.ANCILLARY_ID_MIN:
-            return  # ANC-2
+        column = self._extra_number(chunk.layer)
+        if chunk.layer >= _spec.ANCILLARY_ID_MIN or (column is not None and self.index.extras[column] is None):
+            return  # ANC-2, ANC-3
         head = payload.structure(_spec.TileHead, "head")
         if head.record.layer != chunk.layer:
             log.add_field("TLE-1", head, "layer", f"{head.record.layer}, expected {chunk.layer} by its record")
-        if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
+        if chunk.layer not in KNOWN_LAYERS or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
             log.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
             return
         blocks = self._expected_blocks(chunk.layer)
@@ -84,30 +85,36 @@ class TileChecker:
         for number, attribute in enumerate(blocks):
             if number >= announced and not payload.left:
                 return
-            self._read_block(payload, attribute, number)
+            self._read_block(payload, attribute, number, column)
         if announced == len(blocks):
             payload.finish()
 
+    def _extra_number(self, layer: int) -> int | None:
+        """Return the number of the extra column to which a layer belongs; `None` if there is none."""
+        number = layer - _spec.LAYER_EXTRA
+        return number if 0 <= number < len(self.index.extras) else None
+
     def _expected_blocks(self, layer: int) -> list[int]:
         """Return the attribute of each block of a layer, in order (TLE-2)."""
-        if layer == _spec.LAYER_EXTRA:
-            return [_spec.ATTRIBUTE_EXTRA] * self.index.head.record.extra_count
+        if layer >= _spec.LAYER_EXTRA:
+            return [_spec.ATTRIBUTE_EXTRA]
         return [attribute for attribute, attribute_layer in _spec.ATTRIBUTE_LAYER.items() if attribute_layer == layer]
 
-    def _read_block(self, payload: Payload, expected: int, number: int) -> None:
+    def _read_block(self, payload: Payload, expected: int, number: int, column: int | None) -> None:
         """Read the next block of a layer.
 
         Args:
             payload: the payload, at the block head.
             expected: attribute of the block by the order of the layer.
             number: index of the block in the layer.
+            column: number of the extra column to which the layer belongs.
 
         Raises:
             UnreadableError: attribute or coding are not known, so neither is the size of the block.
         """
         at = payload.at
         attribute = payload.view[at] if payload.left else expected
-        name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
+        name = f"extra[{column}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
         head = read_block_head(payload, name)
         if attribute != expected:
             message = f"{attribute}, expected {expected} ({_spec.ATTRIBUTE_NAMES[expected]}) at index {number}"
@@ -125,7 +132,7 @@ class TileChecker:
         elif coding == _spec.CODING_SPARSE:
             self._read_sparse(payload, name, attribute)
         elif coding == _spec.CODING_RAW:
-            self._read_raw(payload, name, number)
+            self._read_raw(payload, name, column)
         elif attribute == _spec.ATTRIBUTE_MEANS:
             self._read_means(payload, name, coding)
         else:
@@ -212,15 +219,19 @@ class TileChecker:
             record = self.tile.record
             check_box(self.log, record.record, rows, (record.at("corner"), record.path("corner")))
 
-    def _read_raw(self, payload: Payload, name: str, number: int) -> None:
-        """Read and check the block of an extra column: RAW-1, RAW-2; `number` is the index of the column."""
-        params = payload.structure(_spec.RawParams, f"{name}.params")
-        if params.record.column != number:
-            self.log.add_field("RAW-1", params, "column", f"{params.record.column}, expected {number}")
+    def _read_raw(self, payload: Payload, name: str, column: int | None) -> None:
+        """Read and check the block of an extra column, RAW-2; the column is unknown if its record is missing.
+
+        Raises:
+            UnreadableError: the number of values is unknown.
+        """
+        known = None if column is None else self.index.extras[column]
+        if known is None:
+            raise UnreadableError
+        size, components = known
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
-        stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
-        size = self.index.extras[number] if number < len(self.index.extras) else None
-        if size is not None and stream.head.record.width != size:
+        stream = read_stream(payload, f"{name}.stream", components * self.tile.count, width_max)
+        if stream.head.record.width != size:
             self.log.add_field("RAW-2", stream.head, "width", f"{stream.head.record.width}, expected {size}")
 
 

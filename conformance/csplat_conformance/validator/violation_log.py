@@ -146,7 +146,6 @@ _LAYOUTS: Final[dict[type[Any], _Layout]] = {
         _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS
     ),
     _spec.SparseParams: _Layout(_spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS),
-    _spec.RawParams: _Layout(_spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS),
     _spec.StreamHead: _Layout(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS),
     _spec.DeclaredErrorsHead: _Layout(
         _spec.unpack_declared_errors_head, _spec.DECLARED_ERRORS_HEAD_SIZE, _spec.DECLARED_ERRORS_HEAD_OFFSETS
@@ -306,6 +305,10 @@ CODES: Final[dict[str, str]] = {
     "EXR-1": _spec.ERROR_VALUE,
     "EXR-2": _spec.ERROR_VALUE,
     "EXR-3": _spec.ERROR_RESERVED,
+    "EXR-4": _spec.ERROR_VALUE,
+    "EXR-5": _spec.ERROR_VALUE,
+    "EXR-6": _spec.ERROR_UNSUPPORTED,
+    "EXR-7": _spec.ERROR_VALUE,
     "DIR-1": _spec.ERROR_VALUE,
     "DIR-2": _spec.ERROR_UNSUPPORTED,
     "DIR-6": _spec.ERROR_VALUE,
@@ -378,7 +381,6 @@ CODES: Final[dict[str, str]] = {
     "SPA-1": _spec.ERROR_VALUE,
     "SPA-2": _spec.ERROR_RANGE,
     "SPA-3": _spec.ERROR_RANGE,
-    "RAW-1": _spec.ERROR_STREAM,
     "RAW-2": _spec.ERROR_STREAM,
     "MEA-1": _spec.ERROR_RANGE,
     "QUA-1": _spec.ERROR_RANGE,

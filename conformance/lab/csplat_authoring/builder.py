@@ -141,8 +141,9 @@ def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> 
         values = [book.id, book.kind, *book.bands, 0, 0, len(next(iter(book.entries.values())))]
         out.structure(f"codebook[{book.id}]", "codebook_record", values)
     for i, extra in enumerate(scene.extras):
-        encoded = extra.name.encode()
-        out.structure(f"extra[{i}]", "extra_record", [extra.dtype, len(encoded), encoded])
+        texts = extra.name.encode(), extra.semantic.encode()
+        facts = [extra.dtype, extra.components, extra.coding, *map(len, texts), 0, 0, *texts]
+        out.structure(f"extra[{i}]", "extra_record", facts)
     for name in directory:
         out.structure(f"directory[{name}]", "directory_record", _directory(scene, name, chunks[name], offsets[name]))
     for i, tile in enumerate(scene.tiles):
@@ -202,7 +203,7 @@ def _chunks(scene: Scene) -> dict[str, Writer]:
                 )
         for i, tile in sorted(enumerate(scene.tiles), key=lambda item: -item[1].level):
             if layer in tile.layers:
-                payload = _tile(scene, tile, layer) if layer in _spec.LAYER_NAMES else _unknown(tile, layer)
+                payload = _unknown(tile, layer) if layer in dict(tile.unknown) else _tile(scene, tile, layer)
                 out[f"TILE.{i}.{layer}"] = _frame_chunk(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
     return out | {name: out.pop(name) for name in last}
 
@@ -262,16 +263,17 @@ def _codebook(book: Codebook, layer: int) -> Writer:
 def _tile(scene: Scene, tile: Tile, layer: int) -> Writer:
     out = Writer()
     blocks: list[tuple[str, int, Block]] = []
-    if layer == _spec.LAYER_EXTRA:
-        blocks = [(f"extra[{k}]", _spec.ATTRIBUTE_EXTRA, block) for k, block in enumerate(tile.extras)]
+    if layer >= _spec.LAYER_EXTRA:
+        number = layer - _spec.LAYER_EXTRA
+        blocks = [(f"extra[{number}]", _spec.ATTRIBUTE_EXTRA, tile.extras[number])]
     else:
         attributes = [a for a in tile.blocks if _spec.ATTRIBUTE_LAYER[a] == layer]
         if layer == _spec.LAYER_GEOMETRY:
             attributes = [a for a in tile.order if a in attributes]
         blocks = [(_spec.ATTRIBUTE_NAMES[a], a, tile.blocks[a]) for a in attributes]
     out.structure("head", "tile_head", [layer, len(blocks), 0])
-    for k, (name, attribute, block) in enumerate(blocks):
-        _block(out, name, scene, attribute, block, k)
+    for name, attribute, block in blocks:
+        _block(out, name, scene, attribute, block)
     _tail(out, dict(tile.tails).get(layer, b""))
     return out
 
@@ -290,7 +292,7 @@ def _tail(out: Writer, tail: bytes) -> None:
 # Blocks and streams --------------------------------------------------------------------------------
 
 
-def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, column: int) -> None:
+def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block) -> None:
     out.structure(name, "block_head", [attribute, block.coding, 0])
     if block.coding in (_spec.CODING_OFFSET, _spec.CODING_SIGNED):
         _lattice(out, name, block)
@@ -305,8 +307,6 @@ def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, c
     elif block.coding == _spec.CODING_CODEBOOK:
         _codebook_block(out, name, scene, attribute, block)
     else:
-        if block.coding == _spec.CODING_RAW:
-            out.structure(f"{name}.params", "raw_params", [column, 0])
         _stream(out, f"{name}.stream", transpose(block.rows), block.stream_coding)
     if block.tail:
         out.raw(f"{name}.tail", block.tail)
@@ -333,7 +333,7 @@ def _codebook_block(out: Writer, name: str, scene: Scene, attribute: int, block:
         out.value(f"{name}.summand.offset", "i", offset)
         _stream(out, f"{name}.summand.stream", [v - offset for v in block.summands], block.stream_coding)
     if block.escape:
-        _block(out, f"{name}.escape", scene, attribute, block.escape, 0)
+        _block(out, f"{name}.escape", scene, attribute, block.escape)
 
 
 def _morton(row: Sequence[int]) -> int:

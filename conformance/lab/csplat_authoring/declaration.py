@@ -214,7 +214,7 @@ def declared_scene(table: dict[str, Any]) -> Scene:
         elif key == "codebooks":
             values[key] = tuple(_codebook(one) for one in value)
         elif key == "extras":
-            values[key] = tuple(Extra(name, _DTYPES.get(dtype, dtype)) for name, dtype in value)
+            values[key] = tuple(Extra(name, _DTYPES.get(dtype, dtype), *more) for name, dtype, *more in value)
         elif key == "chunks":
             values[key] = tuple(_chunk(one) for one in value)
         elif key == "nodes":

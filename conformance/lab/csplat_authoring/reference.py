@@ -53,11 +53,12 @@ def expected(scene: Scene, index_size: int) -> Expected:
         rows = {attribute: tiles[: len(scene.tiles)] for attribute, tiles in rows.items()}
     result.floats = _floats(scene, rows)
     for i, extra in enumerate(scene.extras):
-        if extra.dtype not in EXTRA_DTYPES:
+        if not extra.is_known:
             continue  # ANC-3
-        bits = [row[0] for tile in scene.tiles for row in tile.extras[i].rows]
-        unsigned = np.array(bits, f"<u{_spec.EXTRA_DTYPE_BYTES[extra.dtype]}")
-        result.extra[extra.name] = unsigned.view(EXTRA_DTYPES[extra.dtype])
+        bits = [row for tile in scene.tiles for row in tile.extras[i].rows]
+        unsigned = np.array(bits, f"<u{_spec.EXTRA_DTYPE_BYTES[extra.dtype]}").reshape(-1, extra.components)
+        values = unsigned.view(EXTRA_DTYPES[extra.dtype])
+        result.extra[extra.name] = values if extra.components > 1 else values[:, 0]
     return result
 
 
@@ -76,12 +77,13 @@ def _header(scene: Scene, index_size: int) -> dict[str, Any]:
         "projection": scene.projection,
         "antialiasing": scene.antialiasing,
         "colour_space": scene.colour_space,
+        "extra_columns": [[extra.name, extra.semantic] for extra in scene.extras if extra.is_known],
     }
 
 
 def required_level(scene: Scene, index_size: int) -> int:
     """Return the lowest resource level that the contents allow (8.1); `index_size` is in bytes."""
-    extra_bytes = sum(_spec.EXTRA_DTYPE_BYTES.get(extra.dtype, 0) for extra in scene.extras)
+    extra_bytes = sum(extra.splat_bytes for extra in scene.extras)
     splat_bytes = 4 * (11 + 3 * (scene.sh_degree + 1) ** 2)
     coarsest: list[Tile] = [] if scene.nodes else list(scene.tiles)
     left = list(scene.tiles)

@@ -87,12 +87,12 @@ class Tile:
         blocks: blocks by attribute (registry value).
         corner: lattice integers.
         exponent: exponent of the means.
-        extras: blocks coded RAW, one per extra column.
+        extras: blocks coded RAW, one per extra column; `unknown` may replace one.
         codebook_ids: ids of codebooks; None: those that the blocks use.
         level: level of detail.
         order: attributes of layer 0 in the order of their blocks.
         tails: bytes after the last block, by layer.
-        unknown: layers that this version does not define, with their payloads.
+        unknown: layers that this version does not read, with their payloads.
     """
 
     blocks: dict[int, Block]
@@ -114,7 +114,8 @@ class Tile:
     def layers(self) -> list[int]:
         """Layers of the tile, ascending."""
         layers = {_spec.ATTRIBUTE_LAYER[attribute] for attribute in self.blocks}
-        return sorted(layers | ({_spec.LAYER_EXTRA} if self.extras else set()) | {layer for layer, _ in self.unknown})
+        extras = {_spec.LAYER_EXTRA + k for k in range(len(self.extras))}
+        return sorted(layers | extras | {layer for layer, _ in self.unknown})
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,19 @@ class Extra:
 
     name: str
     dtype: int
+    components: int = 1
+    semantic: str = ""
+    coding: int = _spec.CODING_RAW
+
+    @property
+    def is_known(self) -> bool:
+        """True unless the column is left out of the result (ANC-3)."""
+        return self.dtype in _spec.EXTRA_DTYPE_NAMES and self.coding == _spec.CODING_RAW
+
+    @property
+    def splat_bytes(self) -> int:
+        """Bytes of a splat in the result."""
+        return self.components * _spec.EXTRA_DTYPE_BYTES[self.dtype] if self.is_known else 0
 
 
 @dataclass(frozen=True)

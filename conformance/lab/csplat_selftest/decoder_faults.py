@@ -373,8 +373,17 @@ def _without_tails(stack: ExitStack) -> None:
     stack.enter_context(mock.patch.object(_spec, "unpack_index_head", unpack))
 
 
-def _known_extras(right: Wrong, *args: Any) -> Any:
-    return tuple(column for column in right(*args) if column.dtype)
+def _skip_by_layer(_right: Wrong, _header: Any, layer: int) -> bool:
+    return layer >= _spec.ANCILLARY_ID_MIN
+
+
+def _splat_by_splat(right: Wrong, cursor: Any, count: int, column: Any) -> Any:
+    elements = right(cursor, count, column)
+    return elements if column.components == 1 else elements.T.reshape(count, column.components)
+
+
+def _without_semantics(right: Wrong, *args: Any) -> Any:
+    return tuple(replace(column, semantic="") for column in right(*args))
 
 
 # Streams -------------------------------------------------------------------------------------------
@@ -637,7 +646,14 @@ _REPLACEMENTS: Final = (
         constants(ANCILLARY_SCENE_FLAGS=0, ANCILLARY_CHUNK_FLAGS=0),
     ),
     DecoderFault("layers", "unknown layers are refused", "ANC-2", constants(ANCILLARY_ID_MIN=256)),
-    DecoderFault("extra types", "unknown types have no block", "ANC-3", replaced("read_extras", _known_extras)),
+    DecoderFault(
+        "extra types",
+        "columns of unknown types are read",
+        "ANC-3",
+        replaced("skips", _skip_by_layer, container.SceneHeader),
+    ),
+    DecoderFault("components", "components lie side by side", "TIL-5", replaced("read_raw", _splat_by_splat)),
+    DecoderFault("semantics", "semantics are not returned", "EXR-7", replaced("read_extras", _without_semantics)),
     DecoderFault("limits", "levels, shifts, columns and nesting are unlimited", "LAT-4", _NO_LIMITS),
     DecoderFault("box", "max_scale is not checked", "TIL-11", replaced("check_max_scale", nothing)),
     DecoderFault("zigzag", "odd values are one too large", "STR-3", replaced("_undo_zigzag", _zigzag)),

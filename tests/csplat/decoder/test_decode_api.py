@@ -288,10 +288,11 @@ def test_reserved_kernels_and_profiles_are_refused_by_name():
 
 
 def test_huge_counts_in_a_small_index_cost_nothing():
-    sizes = {"tile": 2**32 - 1, "directory": 65535, "codebook": 65535, "extra": 65535, "attribute": 255}
+    sizes = {"tile": 2**32 - 1, "directory": 65535, "codebook": 65535, "extra": 64, "attribute": 255}
     for name, size in sizes.items():
         error = refusal(BUILT.patched({f"index.{name}_count": size}))
         assert ("E_INDEX", "IDX-2") == (error.code, error.clause)
+    assert "EXR-4" == refusal(BUILT.patched({"index.extra_count": 65535})).clause
     assert "IDX-7" == refusal(BUILT.patched({"index.splat_count": 2**63})).clause
 
 

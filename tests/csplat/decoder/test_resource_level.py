@@ -22,15 +22,15 @@ HEADER = read_header(build(scene()).data)
 KINDS = ("INDEX", "CODEBOOK", "TILE", "VERSION")
 TABLES = [getattr(_spec, f"RESOURCE_LEVEL_{kind}_BYTES") for kind in KINDS]
 BOUNDS = {level: [table.get(level, float("inf")) for table in TABLES] for level in _spec.RESOURCE_LEVEL_NAMES}
-F64, U8 = ExtraColumn("c", "<f8"), ExtraColumn("d", "|u1")
+F64, WIDE, U8 = ExtraColumn("c", "<f8"), ExtraColumn("w", "<f8", 64), ExtraColumn("d", "|u1")
 
 #: SH degree, extra columns, codebooks (kind, bands, size), splats of the tiles, tiles of each node and its parent.
 CASES = {
     "nothing": (0, [], [], [], []),
     "tile of 32 MiB": (0, [F64] * 57, [], [FULL], []),
     "tile above 32 MiB": (0, [F64] * 57 + [U8], [], [FULL], []),
-    "tile of 64 MiB": (0, [F64] * 121, [], [FULL], []),
-    "tile above 64 MiB": (0, [F64] * 121 + [U8], [], [FULL], []),
+    "tile of 64 MiB": (0, [F64] * 57 + [WIDE], [], [FULL], []),
+    "tile above 64 MiB": (0, [F64] * 57 + [WIDE, U8], [], [FULL], []),
     "scene of 256 MiB": (4, [F64] * 21, [], [FULL] * 8, []),
     "scene above 256 MiB": (4, [F64] * 21, [], [FULL] * 8 + [1], []),
     "scene of 4 GiB": (4, [F64] * 21, [], [FULL] * 128, []),
@@ -58,7 +58,7 @@ def contents(degree, columns, books, counts, nodes):
     own = [FileTile(n, 0, (0, 0, 0), (0, 0, 0), 0.0, {}, level=level) for n, level in zip(counts, levels, strict=True)]
     fields = SceneFields(
         degree, 0, b"\0\0\0", 0.0, (0.0, 0.0, 0.0), (),
-        [_spec.ExtraRecord(dtypes[column.dtype], 1, b"c") for column in columns],
+        [_spec.ExtraRecord(dtypes[c.dtype], c.components, _spec.CODING_RAW, 1, 0, 0, 0, b"c", b"") for c in columns],
         [IndexedCodebook(i, *book) for i, book in enumerate(books)],
     )  # fmt: skip
     roots, at, parts = [], 0, []
@@ -72,7 +72,7 @@ def contents(degree, columns, books, counts, nodes):
 
 
 def sizes_of(spec, degree, columns, books, counts, roots):
-    extra_bytes = sum(np.dtype(column.dtype).itemsize for column in columns)
+    extra_bytes = sum(column.components * np.dtype(column.dtype).itemsize for column in columns)
     wide, plain = spec.splat_bytes(degree, extra_bytes), spec.splat_bytes(degree, 0)
     per_entry = {SHAPE: lambda _: 6, SH: lambda bands: sum(3 * (2 * b + 1) for b in range(bands[0], bands[1] + 1))}
     codebooks = sum(4 * size * per_entry[kind](bands) for kind, bands, size in books)

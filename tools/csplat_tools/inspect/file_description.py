@@ -15,16 +15,20 @@ from mmap import mmap
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import csplat
 from csplat import _spec
 from csplat.decoder import (
     DeclaredBounds,
+    ExtraColumn,
     SceneHeader,
     read_declared_bounds,
     read_header,
     read_metadata,
     read_options,
 )
+from csplat.decoder.container import EXTRA_LAYERS
 from csplat.decoder.tree import read_nodes
 from csplat.disk_files import finite_or_none, size_on_disk
 from csplat.errors import FormatError
@@ -202,7 +206,7 @@ class FileDescription:
             "levels": [asdict(level) for level in self.levels],
             "overhead": dict(self.overhead),
             "codebooks": [asdict(codebook) for codebook in self.codebooks],
-            "extra_columns": [{"name": extra.name, "dtype": extra.dtype} for extra in header.extras],
+            "extra_columns": [asdict(extra) for extra in header.extras],
             "tiles": {"count": len(tiles), **{name: asdict(span) for name, span in self.spans.items()}, **largest},
             "chunks": [
                 {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
@@ -267,7 +271,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "unit_metres": metadata.unit_metres,
             "antialiased": metadata.antialiased,
             "flat": metadata.flat,
-            "extra": {name: str(dtype) for name, dtype in scene.extra.items()},
+            "extra": {name: describe_dtype(dtype) for name, dtype in scene.extra.items()},
             "metadata": dict(metadata.entries),
             "findings": findings_as_json(scene.findings),
         }
@@ -278,7 +282,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
         if scene.levels:
             words["levels"] = f"{' / '.join(f'{splats:,}' for splats in scene.levels)} splats (csplat convert --level)"
         if scene.extra:
-            words["extra"] = ", ".join(f"{name} ({dtype})" for name, dtype in scene.extra.items())
+            words["extra"] = ", ".join(f"{name} ({describe_dtype(dtype)})" for name, dtype in scene.extra.items())
         if metadata.entries:
             words["metadata"] = json.dumps(metadata.entries, sort_keys=True)
         lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
@@ -321,7 +325,7 @@ def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, Attrib
     codebooks = {record.codebook_id: record for record in header.codebooks}
     use: dict[int, AttributeUsage] = {}
     for tile in header.all_tiles:
-        for layer in (tile.layers[id_] for id_ in tile.layers if id_ in _spec.LAYER_NAMES):
+        for layer in (tile.layers[id_] for id_ in tile.layers if not header.skips(id_)):
             _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
     for chunk in header.directory:
         if chunk.type == _spec.CHUNK_CODEBOOK:
@@ -339,14 +343,24 @@ def format_headline(file: FileDescription) -> str:
     return f"{version}, profile {header.profile}, {level}, {format_bytes(header.file_size)}{average}"
 
 
+def describe_dtype(dtype: np.dtype[Any]) -> str:
+    """Describe the type of an extra column: `float32`, or `3 × float32` for several values of a splat."""
+    return f"{dtype.shape[0]} × {dtype.base}" if dtype.shape else str(dtype)
+
+
+def _describe_column(column: ExtraColumn) -> str:
+    """Describe an extra column by its name, type and semantic."""
+    kind = "unknown type or coding" if column.dtype is None else describe_dtype(column.splat_dtype)
+    return f"{column.name} ({kind}{column.semantic and f', {column.semantic}'})"
+
+
 def describe_scene(file: FileDescription) -> dict[str, str]:
     """Describe the scene in words, by title."""
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata)
     words["tiles"] = _describe_tiles(file)
-    extras = ", ".join(f"{extra.name} ({extra.dtype or 'unknown type'})" for extra in header.extras)
-    if extras:
-        words["extra"] = extras
+    if header.extras:
+        words["extra"] = ", ".join(map(_describe_column, header.extras))
     if file.metadata.cameras is not None:
         words["cameras"] = str(len(file.metadata.cameras))
     if file.metadata.training is not None:
@@ -443,9 +457,12 @@ def _summarise_layers(header: SceneHeader) -> dict[str, LayerSummary]:
     for chunk in header.directory:
         if chunk.type == _spec.CHUNK_CODEBOOK:
             codebook_bytes[chunk.layer] += chunk.size
+    names = _spec.LAYER_NAMES | {
+        id_: f"extra {column.name}" for id_, column in enumerate(header.extras, EXTRA_LAYERS[0])
+    }
     sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
     return {
-        _spec.LAYER_NAMES.get(id_, f"layer {id_}"): LayerSummary(
+        names.get(id_, f"layer {id_}"): LayerSummary(
             size, codebook_bytes[id_], _bits_per_splat(size, header.splat_count), tile_count[id_]
         )
         for id_, size in sizes.items()
@@ -472,14 +489,14 @@ def _overhead_sizes(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> d
     """Return the bytes outside attributes, by name. With the bytes of all attributes, they add up to the file's size.
 
     Chunks of one type, of which a file may have several if it is unknown, are added up. "unknown_layers", if there are
-    any, are chunks of the tiles' layers of unknown ids.
+    any, are chunks of the tiles' layers that this version cannot read.
     """
     by_type = Counter[str]()
     for chunk in header.directory:
         if chunk.type != _spec.CHUNK_CODEBOOK:
             by_type[chunk.type.decode("ascii")] += chunk.size
     layers = (item for tile in header.all_tiles for item in tile.layers.items())
-    unknown = sum(layer.size for id_, layer in layers if id_ not in _spec.LAYER_NAMES)
+    unknown = sum(layer.size for id_, layer in layers if header.skips(id_))
     parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **by_type}
     if unknown:
         parts["unknown_layers"] = unknown
@@ -565,8 +582,6 @@ def _walk_coding(
         cursor.skip(_spec.LATTICE_PARAMS_SIZE + _OFFSET_SIZE * columns)
     elif coding == _spec.CODING_SIGNED:
         cursor.skip(_spec.LATTICE_PARAMS_SIZE)
-    elif coding == _spec.CODING_RAW:
-        cursor.skip(_spec.RAW_PARAMS_SIZE)
     elif coding == _spec.CODING_SPARSE:
         cursor.skip(_spec.SPARSE_PARAMS_SIZE)
         _walk_stream(cursor, use)

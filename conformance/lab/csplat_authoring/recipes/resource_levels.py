@@ -27,17 +27,18 @@ _UNKNOWN = range(_spec.ANCILLARY_ID_MIN, 256)  # layers
 
 def valid_level_recipes() -> list[Recipe]:
     """Return recipes of files of the levels B and C."""
-    columns, n = 255, _spec.RESOURCE_LEVEL_TILE_BYTES[_B] // (56 + 8 * 255) + 1
-    raw = [Block(_spec.CODING_RAW, [[0]] * n, _equal(0, 8 * n, 8))] * columns
+    columns, components = 3, _spec.EXTRA_COMPONENTS_MAX
+    n = _spec.RESOURCE_LEVEL_TILE_BYTES[_B] // (56 + 8 * columns * components) + 1
+    raw = [Block(_spec.CODING_RAW, [[0] * components] * n, _equal(0, 8 * components * n, 8))] * columns
     one = _tile_of(n, raw)
-    extras = tuple(Extra(f"c{k}", _spec.EXTRA_DTYPE_F64) for k in range(columns))
+    extras = tuple(Extra(f"c{k}", _spec.EXTRA_DTYPE_F64, components) for k in range(columns))
     books = scene(3, codebooks=_codebooks(65534, 51886))
     return [
         valid_recipe("extreme", "resource_level_b", "codebooks just above the bound of level A", "RSL-1 RSL-2", books),
         valid_recipe(
             "extreme",
             "resource_level_c",
-            "a tile just above the bound of level B, with the most extra columns",
+            "a tile just above the bound of level B, with extra columns of the most components",
             "RSL-1 RSL-2",
             scene(tiles=[one], extras=extras),
         ),
@@ -104,9 +105,9 @@ def _codebooks(first: int, second: int) -> tuple[Codebook, ...]:
 
 
 def _of_tiles() -> list[Recipe]:
-    # 14 floats of 4 bytes and 57 or 121 columns of 8 bytes are 512 or 1,024 bytes, 65,536 times 32 or 64 MiB.
-    a, b = [_spec.EXTRA_DTYPE_F64] * 57, [_spec.EXTRA_DTYPE_F64] * 121
-    byte = [_spec.EXTRA_DTYPE_U8]
+    # 14 floats of 4 bytes and 57 or 121 values of 8 bytes are 512 or 1,024 bytes, 65,536 times 32 or 64 MiB.
+    a, byte = [(_spec.EXTRA_DTYPE_F64, 1)] * 57, [(_spec.EXTRA_DTYPE_U8, 1)]
+    b = [*a, (_spec.EXTRA_DTYPE_F64, 64)]
     return [
         _too_high("b_tile", "a tile at the bound of level A, at level B", *_grown(0, a, [_FULL])),
         _too_low("a_tile", "a tile just above the bound of level A, at level A", *_grown(0, a + byte, [_FULL])),
@@ -119,7 +120,7 @@ def _of_tiles() -> list[Recipe]:
 
 def _of_versions() -> list[Recipe]:
     # 86 floats of degree 4 and 21 columns of 8 bytes are 512 bytes, 8 × 65,536 times 256 MiB.
-    columns, none = [_spec.EXTRA_DTYPE_F64] * 21, _spec.NO_PARENT
+    columns, none = [(_spec.EXTRA_DTYPE_F64, 21)], _spec.NO_PARENT
     at = [_FULL] * 8
     small_root = _grown(4, columns, [*at, 1, 1], coarse=1, nodes=(Node(1, 9), Node(none, 1, 0.5)))
     large_root = _grown(4, [], [_FULL] * 24, coarse=12, nodes=(Node(1, 12), Node(none, 12, 0.5)))
@@ -134,13 +135,17 @@ def _of_versions() -> list[Recipe]:
 
 
 def _grown(
-    degree: int, dtypes: Sequence[int], counts: Sequence[int], coarse: int = 0, nodes: tuple[Node, ...] = ()
+    degree: int,
+    columns: Sequence[tuple[int, int]],
+    counts: Sequence[int],
+    coarse: int = 0,
+    nodes: tuple[Node, ...] = (),
 ) -> tuple[Built, dict[str, Any]]:
     """Return a file with one splat in each tile, and the changes that repeat the splats; SH layers are omitted.
 
     Args:
         degree: SH degree.
-        dtypes: types of the extra columns.
+        columns: types and numbers of components of the extra columns.
         counts: number of splats of each tile, the coarse ones last.
         coarse: number of tiles of level 1.
         nodes: nodes of TREE.
@@ -148,12 +153,12 @@ def _grown(
     tiles = []
     for number, n in enumerate(counts):
         level = int(number >= len(counts) - coarse)
-        sizes = [_spec.EXTRA_DTYPE_BYTES[dtype] for dtype in dtypes]
-        raw = [Block(_spec.CODING_RAW, [[0]], _equal(0, size * n, size)) for size in sizes]
+        sizes = [(_spec.EXTRA_DTYPE_BYTES[dtype], components) for dtype, components in columns]
+        raw = [Block(_spec.CODING_RAW, [[0] * c], _equal(0, size * c * n, size)) for size, c in sizes]
         one = _tile_of(n, [] if level else raw)
         blocks = {attribute: replace(block, rows=block.rows[:1]) for attribute, block in one.blocks.items()}
         tiles.append(replace(one, blocks=blocks, level=level))
-    extras = tuple(Extra(f"c{k}", dtype) for k, dtype in enumerate(dtypes))
+    extras = tuple(Extra(f"c{k}", *column) for k, column in enumerate(columns))
     built = build(scene(degree, tiles=tiles, extras=extras, nodes=nodes))
     finest = counts[: len(counts) - coarse]
     changes: dict[str, Any] = {"index.splat_count": sum(finest)}
