@@ -7,6 +7,7 @@ import importlib.util
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def unsigned_stream(
     return _make_stream(differences, width, (_spec.TRANSFORM_DELTA,), deflate)
 
 
-def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
+def smooth_stream(values: Integers, deflate: DeflateSettings, *, fixed_width: int = 0) -> bytes:
     """Write a stream of unsigned integers or of their differences, whichever is smaller.
 
     Neighbours in Morton order have similar colours and sizes in many scenes, but not in all.
@@ -113,19 +114,21 @@ def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
         deflate: level and library of DEFLATE; at the lowest level, entropies replace trials.
+        fixed_width: as in `unsigned_stream`.
     """
+    write = partial(unsigned_stream, values, fixed_width=fixed_width)
     if deflate.level <= _FASTEST_LEVEL:
         low = values.astype(np.uint8)
         differences = np.diff(low)  # modulo 256; zigzag would not change the entropy
-        return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
+        return write(deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
     trial = trial_settings(deflate)
-    plain_size = len(unsigned_stream(values, trial))
-    delta_size = len(unsigned_stream(values, trial, signed_delta=True))
+    plain_size = len(write(trial))
+    delta_size = len(write(trial, signed_delta=True))
     streams = list[bytes]()  # both, unless one is clearly larger
     if _CLEAR * plain_size <= delta_size:
-        streams.append(unsigned_stream(values, deflate))
+        streams.append(write(deflate))
     if _CLEAR * delta_size <= plain_size:
-        streams.append(unsigned_stream(values, deflate, signed_delta=True))
+        streams.append(write(deflate, signed_delta=True))
     return min(streams, key=len)
 
 
@@ -216,9 +219,10 @@ def codebook_block(
 
 
 def raw_block(values: NDArray[Any], deflate: DeflateSettings) -> bytes:
-    """Return a RAW block of the values [n] or [n, components] of an extra column."""
-    bits = np.ascontiguousarray(values.T, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
-    stream = unsigned_stream(bits.ravel(), deflate, fixed_width=values.itemsize)
+    """Return a RAW block of the values [n] or [n, components] of an extra column; integers may become differences."""
+    bits = np.ascontiguousarray(values.T, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}").ravel()
+    write = unsigned_stream if values.dtype.kind == "f" else smooth_stream
+    stream = write(bits, deflate, fixed_width=values.itemsize)
     return _block_head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + stream
 
 
