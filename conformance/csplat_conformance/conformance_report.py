@@ -29,6 +29,10 @@ from enum import StrEnum
 from html import escape
 from typing import Any
 
+from csplat.errors import counted
+from csplat_conformance import SUITE_VERSION
+from csplat_conformance.manifest import FORMAT
+
 #: Characters that XML 1.0 does not allow, not even as references.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -98,6 +102,7 @@ class ConformanceReport:
         outcomes: in the order of the run.
         notes: lines about the run as a whole.
         extra: statuses that this suite counts in addition to passed, failed and skipped.
+        claim: what the subject may claim if the run was complete and everything passed: "decoder, exact".
     """
 
     suite: str
@@ -105,6 +110,7 @@ class ConformanceReport:
     outcomes: Sequence[Outcome]
     notes: Sequence[str] = ()
     extra: Sequence[Status] = ()
+    claim: str = ""
 
     @property
     def failures(self) -> list[Outcome]:
@@ -115,6 +121,13 @@ class ConformanceReport:
     def passed(self) -> bool:
         """True if something was checked and nothing failed."""
         return bool(self.outcomes) and not self.failures
+
+    @property
+    def badge(self) -> str:
+        """The line by which the subject may claim conformance; "" if it may not."""
+        if not (self.claim and self.passed):
+            return ""
+        return f"conforms to {FORMAT} as {self.claim} (suite {SUITE_VERSION}, {counted(len(self.outcomes), 'check')})"
 
     def levels(self) -> dict[str, dict[str, int]]:
         """Return the counts of each level."""
@@ -155,7 +168,8 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
     counts = [*report.levels().items(), ("all", report.counts())]
     header = ("level", *counts[-1][1])
     rows = [(level, *map(str, count.values())) for level, count in counts]
-    return "\n".join([*lines, *_align_columns([header, *rows], right=True)])
+    badge = ["", report.badge] if report.badge else []
+    return "\n".join([*lines, *_align_columns([header, *rows], right=True), *badge])
 
 
 def _word(status: Status) -> str:
@@ -186,11 +200,12 @@ def _align_columns(rows: Sequence[Sequence[str]], *, right: bool = False) -> lis
 
 
 def to_json(report: ConformanceReport) -> dict[str, Any]:
-    """Return the report as JSON-compatible values: `suite`, `subject`, `passed`, `levels`, `notes`, `outcomes`."""
+    """Return the fields of a report as JSON-compatible values, with `passed`, `badge` and the counts of `levels`."""
     return {
         "suite": report.suite,
         "subject": report.subject,
         "passed": report.passed,
+        "badge": report.badge,
         "levels": report.levels(),
         "notes": list(report.notes),
         "outcomes": [_outcome_json(outcome) for outcome in report.outcomes],

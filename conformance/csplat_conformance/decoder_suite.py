@@ -14,8 +14,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from csplat import _spec
+from csplat.decoder.container import HIGHEST_LEVEL
+from csplat.decoder.limits import Limits
 from csplat.errors import CsplatError, InputError
 from csplat_conformance import adapter, reference_renders
 from csplat_conformance.answers import (
@@ -54,6 +57,7 @@ class DecoderSuiteOptions:
         timeout: time limit of a process, seconds.
         jobs: number of processes at a time; None: one per core.
         by: class of the decoder (spec 9.2).
+        resource_level: highest resource level that the decoder accepts; it must refuse files of higher levels (LIM-2).
     """
 
     pattern: str | None = None
@@ -63,6 +67,7 @@ class DecoderSuiteOptions:
     timeout: float = TIMEOUT_SECONDS
     jobs: int | None = None
     by: str = EXACT
+    resource_level: str = HIGHEST_LEVEL
 
     def __post_init__(self) -> None:
         if not self.levels or any(level not in LEVELS for level in self.levels):
@@ -73,6 +78,19 @@ class DecoderSuiteOptions:
             raise InputError(f"the number of jobs is {self.jobs}, expected 1 or more")
         if self.by not in CLASSES:
             raise InputError(f"the class of decoders is {self.by!r}, expected {' or '.join(CLASSES)}")
+        self.limits  # noqa: B018 - checks the resource level
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of csplat's decoder."""
+        return Limits(resource_level=self.resource_level)
+
+    @property
+    def claim(self) -> str:
+        """What a decoder that passes may claim; "" if not all vectors are compared."""
+        if self.pattern or self.clause or not {*PARTS} <= {*self.levels}:
+            return ""
+        return f"a decoder, {self.by}, resource level {self.resource_level}"
 
     @property
     def near(self) -> FloatsByVector | None:
@@ -111,7 +129,7 @@ def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgr
         outcomes = []
         if any(level in options.levels for level in PARTS):
             outcomes = compare_answer(
-                vector, adapter.answer(vector.data), options.levels, exact=True, near=options.near
+                vector, adapter.answer(vector.data, options.limits), options.levels, exact=True, near=options.near
             )
         if RENDERS in options.levels and vector.views:
             if reference_renders.can_render():
@@ -192,7 +210,7 @@ def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:
     Raises:
         InputError: a pattern matches no name or no clause.
     """
-    vectors = load()
+    vectors = [_at_level(vector, options.resource_level) for vector in load()]
     names = select_names(options.pattern, [vector.name for vector in vectors], "vector")
     selected = [vector for vector in vectors if vector.name in names]
     if options.clause is None:
@@ -201,6 +219,16 @@ def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:
         options.clause, {clause for vector in vectors for clause in vector.clauses}, "clause of a vector"
     )
     return [vector for vector in selected if clauses & {*vector.clauses}]
+
+
+def _at_level(vector: Vector, level: str) -> Vector:
+    """Return a vector with what a decoder of a resource level must answer: E_LIMIT for a file of a higher level."""
+    offset = _spec.HEADER_OFFSETS["resource_level"]
+    stated = _spec.RESOURCE_LEVEL_NAMES.get((vector.data[offset : offset + 1] or b"\0")[0], "")
+    if stated <= level or vector.error.get("clause", "").startswith(("HDR", "RES")):  # which are found in the header
+        return vector
+    error = {"code": _spec.ERROR_LIMIT, "clause": "LIM-2", "offset": offset, "also": [], "optional": ""}
+    return replace(vector, expect={}, error=error, views=[])
 
 
 def _make_report(
@@ -219,4 +247,4 @@ def _make_report(
     outcomes, notes = check_payload_consistency(outcomes)
     if options.by != EXACT:
         notes.append(f"compared with the tolerances of the class {options.by}")
-    return ConformanceReport("decoder", subject, outcomes, notes)
+    return ConformanceReport("decoder", subject, outcomes, notes, claim=options.claim)

@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.errors import InputError
+from csplat_conformance import SUITE_VERSION
+
+#: The format that the vectors test.
+FORMAT = f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}"
 
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
@@ -87,7 +91,7 @@ def to_json(vectors: Sequence[Vector]) -> str:
     """Return the text of manifest.json, with one line per vector."""
     entries = [{key: value for key, value in vars(vector).items() if key != "views" or value} for vector in vectors]
     lines = [json.dumps(entry, ensure_ascii=False, separators=(",", ":")) for entry in entries]
-    head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
+    head = json.dumps({"format": FORMAT, "suite": SUITE_VERSION, "licence": "CC0-1.0"})
     return head[:-1] + ', "vectors": [\n' + ",\n".join(lines) + "\n]}\n"
 
 

@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat.errors import FormatError, InputError
-from csplat_conformance import adapter, decoder_suite
+from csplat_conformance import SUITE_VERSION, adapter, decoder_suite
 from csplat_conformance.answers import Answer, check_payload_consistency, compare_answer
-from csplat_conformance.conformance_report import Status
+from csplat_conformance.conformance_report import Status, to_json, to_table
 from csplat_conformance.decoder_suite import DecoderSuiteOptions, parse_levels, run_builtin, run_command
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.manifest import VECTORS, load, select_names
@@ -315,6 +315,7 @@ def test_a_command_that_cannot_be_run_is_refused_at_once(command):
     ({"timeout": 0}, "the timeout is 0 s"),
     ({"jobs": 0}, "the number of jobs is 0"),
     ({"by": "fast"}, "the class of decoders is 'fast'"),
+    ({"resource_level": "D"}, "limit resource_level is 'D'"),
     ({"pattern": "valid/*,nothing"}, "no vector matches 'nothing'"),
     ({"pattern": "valid/*,"}, "no vector matches ''"),
     ({"clause": "M"}, "no clause of a vector matches 'M'"),
@@ -322,6 +323,29 @@ def test_a_command_that_cannot_be_run_is_refused_at_once(command):
 def test_contradictory_choices_and_patterns_that_match_nothing_are_refused(choice, message):
     with pytest.raises(InputError, match=message):
         run_builtin(DecoderSuiteOptions(**choice))
+
+
+@pytest.mark.slow
+def test_a_complete_run_ends_with_a_line_that_says_what_the_decoder_may_claim():
+    report = run_builtin(DecoderSuiteOptions())
+    words = (
+        rf"conforms to csplat \d+\.\d+ as a decoder, exact, resource level C \(suite {SUITE_VERSION}, [\d,]+ checks\)"
+    )
+    assert re.fullmatch(words, to_table(report).splitlines()[-1])
+    assert report.badge == to_json(report)["badge"]
+    assert "" == replace(report, outcomes=[replace(report.outcomes[0], status=Status.FAILED)]).badge
+    for part in ({"pattern": "valid/quats"}, {"clause": "HDR-1"}, {"pattern": "valid/quats", "levels": (1, 2)}):
+        report = run_builtin(DecoderSuiteOptions(**part))
+        assert ([], "") == (report.failures, report.badge)
+
+
+def test_a_decoder_of_a_resource_level_refuses_files_of_higher_levels():
+    options = DecoderSuiteOptions(pattern="*/resource_level*,valid/quats,render/*", resource_level="A")
+    report = run_builtin(options)
+    assert [] == report.failures
+    assert 1 == len([outcome for outcome in report.outcomes if outcome.name == "extreme/resource_level_c"])
+    report = run_builtin(replace(options, resource_level="B"))
+    assert ["extreme/resource_level_b"] * 3 == [o.name for o in report.outcomes if o.name == "extreme/resource_level_b"]
 
 
 @pytest.mark.slow

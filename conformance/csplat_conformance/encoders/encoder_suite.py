@@ -123,7 +123,8 @@ def run_encoder(
     if render_score is None and "L4" in options.levels and inputs:
         notes.append(f"L4 SKIPPED: {no_render_reason}")
     extra = (Status.WARNED, Status.DECLINED, Status.NOT_PROVED)
-    return ConformanceReport("encoder", command, outcomes, notes, extra)
+    is_complete = not options.pattern and {*options.levels} == {*LEVELS} and render_score is not None
+    return ConformanceReport("encoder", command, outcomes, notes, extra, "an encoder" if is_complete else "")
 
 
 def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.decoder.container import HIGHEST_LEVEL
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -75,6 +76,10 @@ def decoder(
             "--class", metavar="CLASS", show_default=False, help="Tolerance: exact, renderer. Default: exact."
         ),
     ] = EXACT,
+    resource_level: Annotated[
+        str,
+        typer.Option(metavar="A|B|C", show_default=False, help="Highest resource level it accepts. Default: C."),
+    ] = HIGHEST_LEVEL,
     jobs: _Jobs = None,
     timeout: _Timeout = None,
     junit: _Junit = None,
@@ -92,7 +97,8 @@ def decoder(
     a command with {cuts}. --cmd can be repeated. Without it, csplat's own decoder is
     tested. Otherwise a decoder writes its results to {outdir}, or exits with
     status 1 and a line of JSON with the error code:
-    conformance/IMPLEMENTERS.md explains how.
+    conformance/IMPLEMENTERS.md explains how. If everything passes, the last line
+    says what the decoder may claim.
 
     Examples:
       csplat conformance decoder --filter 'invalid/*'
@@ -112,8 +118,9 @@ def decoder(
     levels = shared.checked(parse_levels, level or ",".join(["1", "2", "3", *more]))
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or TIMEOUT_SECONDS
     options = shared.checked(
-        DecoderSuiteOptions, _join_patterns(names), _join_patterns(clauses), levels, timeout=seconds, jobs=jobs, by=by
-    )
+        DecoderSuiteOptions, _join_patterns(names), _join_patterns(clauses), levels, timeout=seconds, jobs=jobs, by=by,
+        resource_level=resource_level,
+    )  # fmt: skip
     with out.bar() as bar:
         if not programs:
             result = run_builtin(options, _bar_mover(bar))
