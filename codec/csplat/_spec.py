@@ -28,9 +28,12 @@ CODEBOOK_ENTRIES_MAX: Final = 65536  # entries of a codebook
 TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
-EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
+EXTRA_COLUMNS_MAX: Final = 64  # extra columns of a file
+EXTRA_COMPONENTS_MAX: Final = 64  # values of an extra column for a splat
+EXTRA_NAME_MAX: Final = 64  # bytes of an extra column's name
+EXTRA_SEMANTIC_MAX: Final = 56  # bytes of an extra column's semantic
 NO_PARENT: Final = 4294967295  # `parent` of a node that has none, 2^32 − 1
-ANCILLARY_ID_MIN: Final = 128  # least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
+ANCILLARY_ID_MIN: Final = 128  # least id that need not be known, of layers, types and codings of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
 PRIVATE_ID_MIN: Final = 240  # least private id of what a decoder must know (12)
 PRIVATE_ANCILLARY_ID_MIN: Final = 192  # least private id of what a decoder need not know (12)
 ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
@@ -214,6 +217,16 @@ META_KEY_VIEW: Final = "view"
 META_KEY_ESTIMATED: Final = "estimated"
 META_KEY_NAMES: Final[dict[str, str]] = {"title": "title", "licence": "licence", "source": "source", "comments": "comments", "training": "training", "up": "up", "view": "view", "estimated": "estimated"}
 
+# Semantics of extra columns
+SEMANTIC_LABEL: Final = "label"
+SEMANTIC_OBJECT_ID: Final = "object_id"
+SEMANTIC_NORMAL: Final = "normal"
+SEMANTIC_INTENSITY: Final = "intensity"
+SEMANTIC_TIME: Final = "time"
+SEMANTIC_FRAME: Final = "frame"
+SEMANTIC_FEATURE: Final = "feature:"
+SEMANTIC_NAMES: Final[dict[str, str]] = {"label": "label", "object_id": "object_id", "normal": "normal", "intensity": "intensity", "time": "time", "frame": "frame", "feature:": "feature"}
+
 # Error codes
 ERROR_MAGIC: Final = "E_MAGIC"
 ERROR_VERSION: Final = "E_VERSION"
@@ -368,24 +381,30 @@ class ExtraRecord(NamedTuple):
     """Extra column record."""
 
     dtype: int
+    components: int
+    coding: int
     name_size: int
+    semantic_size: int
+    reserved_0: int
+    reserved_1: int
     name: bytes
+    semantic: bytes
 
 
-EXTRA_RECORD_STRUCT: Final = struct.Struct("<BB62s")
-EXTRA_RECORD_SIZE: Final = 64
-EXTRA_RECORD_OFFSETS: Final[dict[str, int]] = {"dtype": 0, "name_size": 1, "name": 2}
+EXTRA_RECORD_STRUCT: Final = struct.Struct("<BBBBBBH64s56s")
+EXTRA_RECORD_SIZE: Final = 128
+EXTRA_RECORD_OFFSETS: Final[dict[str, int]] = {"dtype": 0, "components": 1, "coding": 2, "name_size": 3, "semantic_size": 4, "reserved_0": 5, "reserved_1": 6, "name": 8, "semantic": 72}
 
 
 def unpack_extra_record(data: bytes | bytearray | memoryview, offset: int = 0) -> ExtraRecord:
     """Read a ExtraRecord at a byte offset; raise struct.error if the data is too short."""
     v = EXTRA_RECORD_STRUCT.unpack_from(data, offset)
-    return ExtraRecord(v[0], v[1], v[2])
+    return ExtraRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
 
 def pack_extra_record(r: ExtraRecord) -> bytes:
-    """Return the 64 bytes of a ExtraRecord."""
-    return EXTRA_RECORD_STRUCT.pack(r.dtype, r.name_size, r.name)
+    """Return the 128 bytes of a ExtraRecord."""
+    return EXTRA_RECORD_STRUCT.pack(r.dtype, r.components, r.coding, r.name_size, r.semantic_size, r.reserved_0, r.reserved_1, r.name, r.semantic)
 
 
 class DirectoryRecord(NamedTuple):
@@ -689,29 +708,6 @@ def unpack_sparse_params(data: bytes | bytearray | memoryview, offset: int = 0) 
 def pack_sparse_params(r: SparseParams) -> bytes:
     """Return the 8 bytes of a SparseParams."""
     return SPARSE_PARAMS_STRUCT.pack(r.exponent, r.reserved_0, r.present_count)
-
-
-class RawParams(NamedTuple):
-    """Parameters of RAW."""
-
-    column: int
-    reserved_0: int
-
-
-RAW_PARAMS_STRUCT: Final = struct.Struct("<HH")
-RAW_PARAMS_SIZE: Final = 4
-RAW_PARAMS_OFFSETS: Final[dict[str, int]] = {"column": 0, "reserved_0": 2}
-
-
-def unpack_raw_params(data: bytes | bytearray | memoryview, offset: int = 0) -> RawParams:
-    """Read a RawParams at a byte offset; raise struct.error if the data is too short."""
-    v = RAW_PARAMS_STRUCT.unpack_from(data, offset)
-    return RawParams(v[0], v[1])
-
-
-def pack_raw_params(r: RawParams) -> bytes:
-    """Return the 4 bytes of a RawParams."""
-    return RAW_PARAMS_STRUCT.pack(r.column, r.reserved_0)
 
 
 class StreamHead(NamedTuple):

@@ -20,9 +20,12 @@ export const CODEBOOK_ENTRIES_MAX = 65536; // entries of a codebook
 export const TRANSFORMS_MAX = 4; // transforms of a stream
 export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
-export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
+export const EXTRA_COLUMNS_MAX = 64; // extra columns of a file
+export const EXTRA_COMPONENTS_MAX = 64; // values of an extra column for a splat
+export const EXTRA_NAME_MAX = 64; // bytes of an extra column's name
+export const EXTRA_SEMANTIC_MAX = 56; // bytes of an extra column's semantic
 export const NO_PARENT = 4294967295; // `parent` of a node that has none, 2^32 − 1
-export const ANCILLARY_ID_MIN = 128; // least id that need not be known, of layers, types of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
+export const ANCILLARY_ID_MIN = 128; // least id that need not be known, of layers, types and codings of extra columns, projections, antialiasing and colour spaces (ANC-2 to ANC-4)
 export const PRIVATE_ID_MIN = 240; // least private id of what a decoder must know (12)
 export const PRIVATE_ANCILLARY_ID_MIN = 192; // least private id of what a decoder need not know (12)
 export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
@@ -206,6 +209,16 @@ export const META_KEY_VIEW = 'view';
 export const META_KEY_ESTIMATED = 'estimated';
 export const META_KEY_NAMES = Object.freeze({ 'title': 'title', 'licence': 'licence', 'source': 'source', 'comments': 'comments', 'training': 'training', 'up': 'up', 'view': 'view', 'estimated': 'estimated' });
 
+// Semantics of extra columns
+export const SEMANTIC_LABEL = 'label';
+export const SEMANTIC_OBJECT_ID = 'object_id';
+export const SEMANTIC_NORMAL = 'normal';
+export const SEMANTIC_INTENSITY = 'intensity';
+export const SEMANTIC_TIME = 'time';
+export const SEMANTIC_FRAME = 'frame';
+export const SEMANTIC_FEATURE = 'feature:';
+export const SEMANTIC_NAMES = Object.freeze({ 'label': 'label', 'object_id': 'object_id', 'normal': 'normal', 'intensity': 'intensity', 'time': 'time', 'frame': 'frame', 'feature:': 'feature' });
+
 // Error codes
 export const ERROR_MAGIC = 'E_MAGIC';
 export const ERROR_VERSION = 'E_VERSION';
@@ -324,8 +337,9 @@ export function unpackCodebookRecord(view, at) {
   };
 }
 
-export const EXTRA_RECORD_SIZE = 64;
-export const EXTRA_RECORD_OFFSETS = Object.freeze({ dtype: 0, name_size: 1, name: 2 });
+export const EXTRA_RECORD_SIZE = 128;
+export const EXTRA_RECORD_OFFSETS = Object.freeze({ dtype: 0, components: 1, coding: 2, name_size: 3, semantic_size: 4, reserved_0: 5, reserved_1: 6, name: 8, semantic: 72 });
+export const EXTRA_RECORD_RESERVED = Object.freeze({ reserved_0: 5, reserved_1: 6 });
 /**
  * Extra column record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
@@ -334,8 +348,14 @@ export const EXTRA_RECORD_OFFSETS = Object.freeze({ dtype: 0, name_size: 1, name
 export function unpackExtraRecord(view, at) {
   return {
     dtype: view.getUint8(at + 0),
-    name_size: view.getUint8(at + 1),
-    name: new Uint8Array(view.buffer, view.byteOffset + at + 2, 62),
+    components: view.getUint8(at + 1),
+    coding: view.getUint8(at + 2),
+    name_size: view.getUint8(at + 3),
+    semantic_size: view.getUint8(at + 4),
+    reserved_0: view.getUint8(at + 5),
+    reserved_1: view.getUint16(at + 6, true),
+    name: new Uint8Array(view.buffer, view.byteOffset + at + 8, 64),
+    semantic: new Uint8Array(view.buffer, view.byteOffset + at + 72, 56),
   };
 }
 
@@ -543,21 +563,6 @@ export function unpackSparseParams(view, at) {
     exponent: view.getInt16(at + 0, true),
     reserved_0: view.getUint16(at + 2, true),
     present_count: view.getUint32(at + 4, true),
-  };
-}
-
-export const RAW_PARAMS_SIZE = 4;
-export const RAW_PARAMS_OFFSETS = Object.freeze({ column: 0, reserved_0: 2 });
-export const RAW_PARAMS_RESERVED = Object.freeze({ reserved_0: 2 });
-/**
- * Parameters of RAW. 64-bit integers are BigInt, u8[n] is a view.
- * @param {DataView} view
- * @param {number} at
- */
-export function unpackRawParams(view, at) {
-  return {
-    column: view.getUint16(at + 0, true),
-    reserved_0: view.getUint16(at + 2, true),
   };
 }
 
