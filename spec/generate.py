@@ -25,6 +25,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 REGISTRY = ROOT / "spec" / "registry.toml"
 DOCUMENTS = (ROOT / "spec" / "format.md", ROOT / "spec" / "encoders.md")  # each table is in one of them
+APART = ("resource_level", "measure", "error_flag")  # enumerations with a place of their own
 PYTHON = ROOT / "codec" / "csplat" / "_spec.py"
 RULES = ROOT / "conformance" / "lab" / "csplat_authoring" / "_rules.py"
 JAVASCRIPT = ROOT / "codec" / "js" / "spec.mjs"
@@ -547,7 +548,9 @@ def c_value(value: Any) -> str:
 def with_tables(texts: dict[Path, str], registry: Registry) -> dict[Path, str]:
     """Return the texts of the spec with updated tables; SystemExit if a table is not in exactly one place."""
     tables = {"constants": constant_table(registry)}
-    tables |= {f"enum {enum['name']}": enum_table(enum) for enum in registry["enum"]}
+    tables |= {f"enum {name}": enum_table(enum_named(registry, name)) for name in APART}
+    others = [enum for enum in registry["enum"] if enum["name"] not in APART]
+    tables["registries"] = "\n".join(f"### {title_of(enum)}\n\n{enum_table(enum)}" for enum in others)
     tables |= {f"structure {item['name']}": structure_table(item, registry) for item in registry["structure"]}
     places: list[str] = []
 
@@ -569,6 +572,11 @@ def with_tables(texts: dict[Path, str], registry: Registry) -> dict[Path, str]:
 def constant_table(registry: Registry) -> str:
     rows = [f"| `{c['name'].upper()}` | {c['value']} | {c['text']} |" for c in registry["constant"]]
     return "\n".join(["| name | value | meaning |", "|---|---|---|", *rows]) + "\n"
+
+
+def title_of(enum: Registry) -> str:
+    """Return the title of an enumeration without what is in brackets."""
+    return str(enum["title"]).split(" (")[0]
 
 
 def enum_table(enum: Registry) -> str:
@@ -612,7 +620,7 @@ def values_text(rule: Registry, registry: Registry) -> str:
         name = rule.get("enum") or rule["flags"]
         if not name:
             return "0"
-        title = enum_named(registry, name)["title"].split(" (")[0]
+        title = title_of(enum_named(registry, name))
         registered = f"registry of {title[0].lower()}{title[1:]}"
         if "enum" in rule:
             return registered + "; from ANCILLARY_ID_MIN on, any" * rule.get("ancillary", False)
