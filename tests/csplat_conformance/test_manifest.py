@@ -20,11 +20,12 @@ from csplat import _spec
 from csplat.context import Context
 from csplat.decoder import Limits, iter_tiles
 from csplat_authoring._rules import CHOICES, RANGES
-from csplat_authoring.annexes import UNCOVERED, annex, clause_ids, clause_map, replace_generated
 from csplat_authoring.boundaries import cases, held
 from csplat_authoring.builder import build
+from csplat_authoring.clauses import DOCUMENTS, UNCOVERED, clause_ids, clause_map, specification
 from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.samples import rich_scene
+from csplat_authoring.worked_example import worked_example
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders.reference_ply import PlyRows, source_of_rows
 from csplat_conformance.manifest import VECTORS, load, summarise, to_json
@@ -33,7 +34,9 @@ from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.fuzzing.damage import built_from
 
 ROOT = Path(__file__).resolve().parents[2]
-TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+FORMAT, ENCODERS = (path.read_text(encoding="utf-8") for path in DOCUMENTS)
+#: The normative sections from 3 on.
+BODY = FORMAT.split("## 3 Terms")[1].split("## 10 Versioning")[0] + ENCODERS.split("## E Guidance")[0]
 VECTOR_LIST = load()
 NAMED = {vector.name: vector for vector in VECTOR_LIST}
 VALID = [vector for vector in VECTOR_LIST if not vector.error]
@@ -271,9 +274,8 @@ def test_files_and_pictures_are_those_of_the_manifest():
 
 def clauses_with_codes():
     """Yield clause and error code of each requirement that names one: the last code before the id."""
-    body = TEXT.split("## 3 Terms")[1].split("## A Worked example")[0]
-    for match in re.finditer(r"\[([A-Z]{3}-\d+)\]", body):
-        sentence = re.split(r"\n\n|\]", body[: match.start()])[-1]
+    for match in re.finditer(r"\[([A-Z]{3}-\d+)\]", BODY):
+        sentence = re.split(r"\n\n|\]", BODY[: match.start()])[-1]
         codes = re.findall(r"\((E_[A-Z]+)", sentence)
         if codes:
             yield match[1], set(codes)
@@ -429,15 +431,14 @@ def test_the_values_and_the_code_of_the_guide_give_the_declared_errors(row, sour
 
 def test_every_must_ends_in_a_clause_id():
     # An error could not cite a paragraph that has a requirement and no id.
-    body = TEXT.split("## 3 Terms")[1].split("## 10 Versioning")[0]
-    body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
+    body = re.sub(r"```.*?```", "", BODY, flags=re.DOTALL)
     sentences = re.findall(r"[^.\n|][^|]*?MUST(?: NOT)?\b[^|]*?(?:\[[A-Z]{3}-\d+\]|\n\n)", body)
     assert [] == [sentence for sentence in sentences if not sentence.endswith("]")]
 
 
 def test_every_clause_has_one_id_and_is_covered_by_a_vector_or_excused():
     covered = {clause for vector in VECTOR_LIST for clause in vector.clauses}
-    assert sorted(clause_ids(TEXT)) == sorted([*covered, *UNCOVERED])
+    assert sorted(clause_ids(specification())) == sorted([*covered, *UNCOVERED])
 
 
 def test_an_excuse_that_points_at_a_test_finds_the_clause_there():
@@ -449,6 +450,6 @@ def test_an_excuse_that_points_at_a_test_finds_the_clause_there():
     assert [] == failures({clause: clause for clause in UNCOVERED}, check)
 
 
-def test_annexes_equal_the_output_of_the_recipes():
-    with_example = replace_generated(TEXT, "worked example", annex())
-    assert TEXT == replace_generated(with_example, "clause map", clause_map(TEXT, VECTOR_LIST))
+def test_example_and_map_of_clauses_equal_the_output_of_the_recipes():
+    assert worked_example() == (ROOT / "spec" / "example.md").read_text(encoding="utf-8")
+    assert clause_map(specification(), VECTOR_LIST) == (ROOT / "conformance" / "CLAUSES.md").read_text(encoding="utf-8")

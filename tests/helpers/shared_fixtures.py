@@ -108,12 +108,13 @@ def sample_path() -> Path:
 @pytest.fixture(scope="session")
 def spec() -> SimpleNamespace:
     """The pseudo-code of the specification, as functions."""
-    text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+    from csplat_authoring.clauses import specification
+
     names = {
         "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
         "floor": math.floor, "NO_PARENT": _spec.NO_PARENT, "bits": lambda x: int(np.float32(x).view(np.uint32)),
     }  # fmt: skip
-    blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
+    blocks = re.findall(r"```python spec-test\n(.*?)```", specification(), re.DOTALL)
     assert blocks
     for block in blocks:
         exec(block, names)  # noqa: S102 - the text is the project's own

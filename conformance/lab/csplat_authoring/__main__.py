@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: CC0-1.0
-"""Write the vectors, the manifest, and annexes A and C of the spec.
+"""Write the vectors, the manifest, `spec/example.md` and `conformance/CLAUSES.md`.
 
 Usage:
     python -m csplat_authoring           # write outdated files, remove files without a recipe
@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from csplat import _spec
-from csplat_authoring.annexes import annex, clause_map, replace_generated
+from csplat_authoring.clauses import clause_map, specification
 from csplat_authoring.recipe import Recipe
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected
+from csplat_authoring.worked_example import worked_example
 from csplat_conformance.manifest import VECTORS, Vector, load, picture_name, summarise, to_json
 from csplat_conformance.reference_renders import psnr, read_png, reference_render, write_png
 
-#: The text of the specification.
-FORMAT = Path(__file__).parents[3] / "spec" / "format.md"
+_ROOT = Path(__file__).parents[3]
 
 _SAME_PICTURE = 60.0  # dB; one of 16 values differs by 1
 
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def files(*, renders: bool = False) -> dict[Path, bytes]:
-    """Return every generated file: the vectors, the manifest, the spec with its annexes.
+    """Return every generated file: the vectors, the manifest, the worked example, the map of clauses.
 
     Args:
         renders: draw reference images again; by default existing images stay.
@@ -73,11 +73,8 @@ def files(*, renders: bool = False) -> dict[Path, bytes]:
         result[path] = data
         vectors.append(vector)
     result[VECTORS / "manifest.json"] = to_json(vectors).encode()
-    if FORMAT.exists():
-        text = FORMAT.read_text(encoding="utf-8")
-        text = replace_generated(text, "worked example", annex())
-        text = replace_generated(text, "clause map", clause_map(text, vectors))
-        result[FORMAT] = text.encode()
+    result[_ROOT / "spec" / "example.md"] = worked_example().encode()
+    result[_ROOT / "conformance" / "CLAUSES.md"] = clause_map(specification(), vectors).encode()
     return result
 
 

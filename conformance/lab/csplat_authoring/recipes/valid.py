@@ -9,7 +9,6 @@ from functools import partial
 from itertools import combinations, cycle
 
 from csplat import _spec
-from csplat_authoring.annexes import example_scene
 from csplat_authoring.builder import SIZED
 from csplat_authoring.recipe import Recipe, valid_recipe
 from csplat_authoring.samples import (
@@ -37,6 +36,7 @@ from csplat_authoring.samples import (
     with_stream_codings,
 )
 from csplat_authoring.scene import Block, Chunk, Codebook, Extra, Scene, Stream, Tile
+from csplat_authoring.worked_example import example_scene
 
 _valid = partial(valid_recipe, "valid")
 _DELTA, _ZIGZAG, _PLANES, _RUNS = (
@@ -55,7 +55,11 @@ def valid_recipes() -> list[Recipe]:
     many = [tile(k, 1, k % 2, corner=(k, -k, 2 * k), exponent=k % 5 - 2) for k in range(24)]
     return [
         valid_recipe(
-            "valid", "worked_example", "the file that annex A reads byte by byte", "COV-2 DIR-3 TIL-4", example_scene()
+            "valid",
+            "worked_example",
+            "the file that example.md reads byte by byte",
+            "COV-2 DIR-3 TIL-4",
+            example_scene(),
         ),
         valid_recipe(
             "valid", "record_tails_longest", "a head and records of 255 bytes", "IDX-8 IDX-9", _longest_records()

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: CC0-1.0
-"""Annexes A and C of the spec: the worked example, byte by byte, and the map of clauses to vectors."""
+"""The worked example of the specification, byte by byte: `spec/example.md`."""
 
 from __future__ import annotations
 
-import re
 import struct
-from collections.abc import Sequence
 from typing import Final
 
 from csplat import _spec
@@ -13,9 +11,6 @@ from csplat_authoring.builder import Built, build
 from csplat_authoring.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, axis, levels, offset, signed
 from csplat_authoring.scene import Attribute, Chunk, Scene, Stream, Tile
 from csplat_conformance.fields import Field
-from csplat_conformance.manifest import Vector
-
-# Annex A -------------------------------------------------------------------------------------------
 
 
 def example_scene() -> Scene:
@@ -52,9 +47,12 @@ def example_scene() -> Scene:
     )
 
 
-_INTRO = """The file is `conformance/csplat_conformance/vectors/valid/worked_example.csplat`. It has {size} bytes and
+_INTRO = """# A file, byte by byte
+
+<!-- Written by csplat_authoring: do not edit. -->
+The file is `conformance/csplat_conformance/vectors/valid/worked_example.csplat`. It has {size} bytes and
 contains two splats of SH degree 1 in one tile, and a title. Each row of a table is one field. Offsets are decimal,
-bytes hexadecimal in the order of the file.
+bytes hexadecimal in the order of the file. Section numbers are those of [format.md](format.md).
 """
 
 #: Names of the spec's structures, and the sections that define them.
@@ -73,10 +71,9 @@ _SECTIONS: Final = {
 }
 
 _NOTES: Final = {
-    "header.version_minor": "version 0.4",
+    "header.version_minor": f"version {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
     "header.profile": "BASE",
     "header.resource_level": "A",
-    "header.index_size": "so the chunks begin at 32 + 280 = 312",
     "header.header_crc": "of the bytes 0 to 27",
     "index.kernel": "ELLIPSE",
     "index.splat_count": "N",
@@ -135,8 +132,8 @@ red is 1 in the first coefficient of both splats, and blue is −0.25 in the thi
 """
 
 
-def annex() -> str:
-    """Return annex A: every byte of the file with its field, and the values that follow."""
+def worked_example() -> str:
+    """Return the page: every byte of the file with its field, and the values that follow."""
     built = build(example_scene())
     parts = [_INTRO.format(size=len(built.data))]
     heading = ""
@@ -150,6 +147,8 @@ def annex() -> str:
         note = f"; {_NOTES[name]}" if name in _NOTES else ""
         label = name.removeprefix(f"{heading}.").removeprefix(f"{prefix}/")
         value = _value(entry, raw)
+        if name == "header.index_size":
+            note = f"; so the chunks begin at {_spec.HEADER_SIZE} + {value} = {_spec.HEADER_SIZE + int(value)}"
         if name.endswith(".crc"):
             start, end = _covered_range(built, name)
             value = f"of the bytes {start} to {end - 1}"
@@ -171,58 +170,3 @@ def _value(entry: Field, raw: bytes) -> str:
         return f'"{raw.decode()}"' if raw.isalpha() and raw.isascii() and len(raw) == 4 else ""
     values = struct.unpack(entry.format, raw)
     return ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in values)
-
-
-# Annex C -------------------------------------------------------------------------------------------
-
-#: Clauses that no vector covers, with the reason or the tests that cover them instead.
-UNCOVERED: Final = {
-    "CHK-5": "applies to editors",
-    "LIM-2": "applies to a decoder's interface: `test_resource_level.py`",
-    "CHK-7": "the vectors that are marked optional, for decoders that read the payload",
-    "SER-5": "checking declared errors requires the source: `test_bounds_verification.py`, `test_validation.py`",
-    "SER-6": "applies to encoders: `test_bounds_verification.py`",
-    "SER-7": "applies to checkers of declared errors: `test_spec_pseudocode.py`",
-    "SRC-1": "applies to encoders: `test_error_bounds.py`",
-    "SRC-2": "applies to encoders: `test_error_bounds.py`",
-    "SRC-3": "applies to encoders: `test_encoder_suite.py`",
-    "SRC-4": "applies to encoders: `test_encode_api.py`",
-    "CNF-2": "all vectors together",
-    "CNF-3": "no file can prove the absence of crashes: `conformance/lab/fuzz.py`, `test_decode_api.py`",
-    "CNF-4": "applies to a decoder's interface: `test_decode_api.py`",
-    "CNF-5": "applies to encoders: `test_encode_api.py`, `test_encoder_suite.py`",
-    "CNF-6": "applies to encoders: `test_encode_api.py`, `test_encoder_suite.py`",
-    "CNF-10": "applies to encoders: `test_encode_api.py`",
-    "CNF-9": "applies to a decoder's documentation",
-}
-
-_NAMES_MAX = 4
-
-
-def clause_ids(text: str) -> list[str]:
-    """Return the ids of the clauses in the text of the spec, in order and with repetitions."""
-    return re.findall(r"\[([A-Z]{3}-[0-9]+)\]", text)
-
-
-def clause_map(text: str, vectors: Sequence[Vector]) -> str:
-    """Return annex C, with a row for each clause."""
-    covering: dict[str, list[str]] = {}
-    for vector in vectors:
-        for clause in vector.clauses:
-            covering.setdefault(clause, []).append(vector.name)
-    lines = ["| clause | vectors, or the reason for having none |", "|---|---|"]
-    for clause in clause_ids(text):
-        # Invalid vectors come first: they are the most specific to a clause.
-        names = sorted(covering.get(clause, []), key=lambda name: not name.startswith("invalid/"))
-        cell = ", ".join(f"`{name}`" for name in names[:_NAMES_MAX])
-        if len(names) > _NAMES_MAX:
-            cell += f" and {len(names) - _NAMES_MAX} more"
-        lines.append(f"| {clause} | {cell or UNCOVERED.get(clause, 'missing')} |")
-    return "\n".join(lines) + "\n"
-
-
-def replace_generated(text: str, name: str, body: str) -> str:
-    """Return the spec's text with the part between two marks replaced."""
-    begin, end = f"<!-- begin generated: {name} -->\n", "<!-- end generated -->"
-    before, rest = text.split(begin, 1)
-    return before + begin + body + rest[rest.index(end) :]
