@@ -340,6 +340,16 @@ class SplatFile(Scene):
             window.fetch([*texts, *_side_ranges(request), *_layer_ranges(request.tiles, request.degree)])
             return decode_request(request).model
 
+    def pieces(self) -> Iterator[bytes]:
+        """Yield the bytes of the file, a few megabytes at a time.
+
+        Raises:
+            StoreError, OSError: as in `csplat.open`.
+        """
+        store = self.window().store
+        for start in range(0, store.size, store.sizes.batch):
+            yield from store.read([(start, min(start + store.sizes.batch, store.size))])
+
     def window(self) -> FileWindow:
         """Return a view into which parts of the file can be fetched."""
         if not self._open:
