@@ -36,6 +36,8 @@ SOURCES = {
     "c.md": "codec/c/README.md",
     "format.md": "spec/format.md",
     "media-type.md": "spec/media-type.md",
+    "gltf.md": "spec/gltf.md",
+    "gltf-assets.md": "conformance/gltf/README.md",
     "conformance.md": "conformance/README.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",

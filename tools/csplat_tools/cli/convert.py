@@ -59,7 +59,7 @@ def convert(
     up in glTF. A line reports what the format cannot hold. For .csplat files,
     `csplat encode` has presets and targets. A new folder with a file
     lod-meta.json gets streamed SOG, with all levels of detail. --compress
-    makes a .glb 9 to 24 times smaller: its splats are a .csplat file, as the
+    makes a .glb about 15 times smaller: its splats are a .csplat file, as the
     extension CSPLAT_gaussian_splatting_compression_1 specifies. IN is copied
     bit for bit if it is a .csplat file, and encoded otherwise.
 

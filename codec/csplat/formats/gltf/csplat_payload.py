@@ -158,13 +158,13 @@ def open_payload(document: GltfDocument, view: int) -> SplatFile:
         FormatError, UnsupportedError, LimitError: as in `csplat.open`; the error has the path of the buffer view.
         InputError: there is no such buffer view, or it or the file violates a clause.
     """
-    data, _ = document.view(view)
     record = document.item("bufferViews", view)
-    if record.get("byteOffset", 0) % _ALIGNMENT:
+    if document.integer(record, ("bufferViews", view), "byteOffset", 0) % _ALIGNMENT:
         raise document.error(("bufferViews", view, "byteOffset"), f"it is no multiple of {_ALIGNMENT} (GLT-3)")
     for key in ("byteStride", "target"):
         if key in record:
             raise document.error(("bufferViews", view, key), "a .csplat file has none (GLT-3)")
+    data, _ = document.view(view)
     store = MemoryStore(data)
     store.name = f"{document.path}, bufferViews/{view}"
     opened = SplatFile(store, Limits())
