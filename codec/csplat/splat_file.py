@@ -262,7 +262,8 @@ class SplatFile(Scene):
         if data is None:
             decoded = self._decode(self._default_tiles() if tiles is None else tiles, None)
         else:
-            request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
+            with self._store.named_errors():
+                request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
             decoded = request_tiles(request, DEFAULT_CONTEXT)
         with self._store.named_errors():
             for tile in decoded:

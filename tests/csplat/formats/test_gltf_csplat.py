@@ -289,11 +289,13 @@ def test_payloads_that_break_a_clause_are_refused_by_it():
 def test_errors_of_the_payload_keep_their_code(tmp_path):
     data = (ASSETS / "large_coordinates.glb").read_bytes()
     root, buffer = unpack(data)
-    for broken, code in ((b"spz" + buffer[3:], "E_MAGIC"), (buffer[:40] + b"\0" + buffer[41:], "E_CRC")):
+    last = len(payload_of(data)) - 1
+    changed = ((0, "E_MAGIC"), (40, "E_CRC"), (last, "E_CRC"))
+    for broken, code in ((buffer[:at] + bytes([buffer[at] ^ 8]) + buffer[at + 1 :], code) for at, code in changed):
         (tmp_path / "a.glb").write_bytes(pack(root, broken))
         with pytest.raises(FormatError) as caught:
             csplat.read(tmp_path / "a.glb")
-        assert (code, f"{tmp_path / 'a.glb'}, bufferViews/0") == (caught.value.code, caught.value.path)
+        assert (code, f"{tmp_path / 'a.glb'}, buffer view 0") == (caught.value.code, caught.value.path)
 
 
 def test_damage_is_refused_or_read(tmp_path):

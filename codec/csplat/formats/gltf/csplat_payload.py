@@ -38,7 +38,7 @@ COMPRESSION = "CSPLAT_gaussian_splatting_compression_1"
 SH_DEGREE_MAX = 3
 
 _POINTS, _TRIANGLES = 0, 4  # values of `mode`; the default is triangles
-_ALIGNMENT = 4  # bytes (GLT-3)
+_ALIGNMENT = 4  # bytes (GLT-16)
 _DEFAULTS = {"projection": _spec.PROJECTION_NAMES[_spec.PROJECTION_PERSPECTIVE]}  # of KHR_gaussian_splatting
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 _ORIGIN_MAX = 2.0**20  # scene units (GLT-10)
@@ -160,13 +160,13 @@ def open_payload(document: GltfDocument, view: int) -> SplatFile:
     """
     record = document.item("bufferViews", view)
     if document.integer(record, ("bufferViews", view), "byteOffset", 0) % _ALIGNMENT:
-        raise document.error(("bufferViews", view, "byteOffset"), f"it is no multiple of {_ALIGNMENT} (GLT-3)")
+        raise document.error(("bufferViews", view, "byteOffset"), f"it is no multiple of {_ALIGNMENT} (GLT-16)")
     for key in ("byteStride", "target"):
         if key in record:
-            raise document.error(("bufferViews", view, key), "a .csplat file has none (GLT-3)")
+            raise document.error(("bufferViews", view, key), "a .csplat file has none (GLT-16)")
     data, _ = document.view(view)
     store = MemoryStore(data)
-    store.name = f"{document.path}, bufferViews/{view}"
+    store.name = f"{document.path}, buffer view {view}"
     opened = SplatFile(store, Limits())
     if broken := violation(opened.header):
         raise document.error(("bufferViews", view), f"a glTF cannot have this .csplat file, {broken}")
@@ -211,7 +211,7 @@ def check_primitive(
     of_splats = [name for name in types if not name.startswith("_")]
     have_values = {"bufferView" in document.item("accessors", attributes[name]) for name in of_splats}
     if len(have_values) > 1:
-        raise document.error(at, "some accessors of splats have a bufferView, expected all or none (GLT-11)")
+        raise document.error(at, "some accessors of splats have a bufferView, expected all or none (GLT-20)")
     if have_values == {True}:
         return
     for key, corner in zip(("min", "max"), bounds, strict=True):
@@ -237,12 +237,12 @@ def _check_accessor(document: GltfDocument, index: object, count: int, types: tu
     json_path: JsonPath = ("accessors", str(index))
     rows = document.integer(record, json_path, "count")
     if rows != count:
-        raise document.error((*json_path, "count"), f"found {rows}, its .csplat file has {count} splats (GLT-11)")
+        raise document.error((*json_path, "count"), f"found {rows}, its .csplat file has {count} splats (GLT-19)")
     if types is None:
         return
     found = (record.get("type"), record.get("componentType"))
     if found[0] != types[0] or ("bufferView" not in record and found[1] != types[1]):
-        raise document.error(json_path, f"found {found[0]} of {found[1]}, expected {types[0]} of {types[1]} (GLT-11)")
+        raise document.error(json_path, f"found {found[0]} of {found[1]}, expected {types[0]} of {types[1]} (GLT-18)")
 
 
 def _extension_object(document: GltfDocument, placed: PlacedPrimitive) -> tuple[dict[str, Any], JsonPath]:
