@@ -289,6 +289,7 @@ KINDS: dict[str, FileKind] = {
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
         ),
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
+        FileKind("gltf-csplat", "glTF with csplat", (".csplat.glb",)),
         FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
         FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
         FileKind("parquet", "Parquet", (".parquet",), _starts_with(b"PAR1"), f"{_NOT_READ} the program that wrote it"),

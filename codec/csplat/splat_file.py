@@ -262,7 +262,8 @@ class SplatFile(Scene):
         if data is None:
             decoded = self._decode(self._default_tiles() if tiles is None else tiles, None)
         else:
-            request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
+            with self._store.named_errors():
+                request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
             decoded = request_tiles(request, DEFAULT_CONTEXT)
         with self._store.named_errors():
             for tile in decoded:
@@ -339,6 +340,16 @@ class SplatFile(Scene):
             check_budget(self.header, request.tiles, request.degree, splat_bytes, self._limits, whole=request.whole)
             window.fetch([*texts, *_side_ranges(request), *_layer_ranges(request.tiles, request.degree)])
             return decode_request(request).model
+
+    def pieces(self) -> Iterator[bytes]:
+        """Yield the bytes of the file, a few megabytes at a time.
+
+        Raises:
+            StoreError, OSError: as in `csplat.open`.
+        """
+        store = self.window().store
+        for start in range(0, store.size, store.sizes.batch):
+            yield from store.read([(start, min(start + store.sizes.batch, store.size))])
 
     def window(self) -> FileWindow:
         """Return a view into which parts of the file can be fetched."""

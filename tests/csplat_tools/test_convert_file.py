@@ -352,6 +352,24 @@ def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):
     assert not (tmp_path / "no").exists()
 
 
+def test_compress_makes_a_glb_of_a_csplat_file(tmp_path, make_model):
+    source, output = tmp_path / "a.csplat", tmp_path / "a.glb"
+    csplat.encode(make_model(30, 2), out=source)
+    done = invoke("convert", source, output, "--compress", "--no-loss")
+    assert 0 == done.exit_code, done.output
+    assert source.read_bytes() in output.read_bytes()
+    for words in (("info", output), ("lint", output), ("convert", output, tmp_path / "b.ply")):
+        assert 0 == invoke(*words).exit_code
+    assert 0 == invoke("convert", output, tmp_path / "plain.glb").exit_code
+    assert 0 == invoke("convert", tmp_path / "plain.glb", tmp_path / "again.glb", "--compress").exit_code
+    for words, message in (
+        ((source, tmp_path / "c.spz", "--compress"), "--compress compresses the splats of a .glb, but OUT is"),
+        ((source, tmp_path / "c.glb", "--compress", "--to", "spz"), "but --to is spz"),
+    ):
+        refused = invoke("convert", *words)
+        assert (2, True) == (refused.exit_code, message in " ".join(refused.output.split()))
+
+
 #: Contents that the help and the guide call `header`.
 HEADER = {"coordinate_system", "origin", "unit_metres", "metadata", "antialiased", "flat", "colour_space"}
 

@@ -333,8 +333,9 @@ def convert_file(
         changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
         scene, counts = levels[0], tuple(changed.count for changed in levels if changed.count)
-        lost = writes.losses(scene)
-        rounded = tuple(name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.sh_degree))
+        lost, keeps = writes.losses(scene), writes.keeps(scene)
+        exact = frozenset(ARRAYS) if keeps else writes.exact
+        rounded = tuple(name for name in ARRAYS if name not in exact and (name != "shN" or scene.sh_degree))
         result = Conversion(
             reader.format, writes.name, reader.count, scene.count, scene.sh_degree, counts or (0,),
             size_on_disk(local), writes.expected_bytes(scene), lost, rounded, (),
@@ -343,7 +344,7 @@ def convert_file(
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
         reporting = [
-            with_progress(changed, f"reading level {level + at}" if more else "reading", progress)
+            changed if keeps else with_progress(changed, f"reading level {level + at}" if more else "reading", progress)
             for at, changed in enumerate(levels)
         ]
         if dry_run:

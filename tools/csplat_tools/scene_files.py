@@ -318,6 +318,8 @@ class MetadataOverrides:
         return model.with_metadata(self.apply(model.metadata))
 
     def apply_to_scene(self, scene: Scene) -> Scene:
-        """Return the scene with these overrides."""
+        """Return the scene with these overrides; the scene itself without any."""
+        if self == MetadataOverrides():
+            return scene
         metadata = self.apply(scene.metadata)
         return scene.map(lambda block: block.with_metadata(metadata))

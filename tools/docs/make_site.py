@@ -39,6 +39,8 @@ SOURCES = {
     "example.md": "spec/example.md",
     "versions.md": "spec/VERSIONS.md",
     "media-type.md": "spec/media-type.md",
+    "gltf.md": "spec/gltf.md",
+    "gltf-assets.md": "conformance/gltf/README.md",
     "conformance.md": "conformance/README.md",
     "clauses.md": "conformance/CLAUSES.md",
     "architecture.md": "ARCHITECTURE.md",

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extract a part of a file: copy tiles to another file without decoding their streams."""
+"""Extract a part of a file, or its finest level: copy tiles to another file without decoding their streams."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Container, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import accumulate
 from typing import Any
@@ -32,6 +32,8 @@ from csplat.splat_file import SplatFile, tiles_touching
 
 #: Chunks that are copied to an extract; declared bounds and options refer to the whole file.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
+#: Chunks that are copied with the whole of level 0, to which declared bounds refer.
+_KEPT_WITH_ALL = (*_KEPT, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 _ALL = 1 << 26  # maximum size of the data fetched at once from all files, bytes
 
 
@@ -87,12 +89,30 @@ def extract(
         return _write_extract(opened.window(), opened.header, tiles, opened.nodes, output)
 
 
+def extract_finest(
+    file: SplatFile, output: str | os.PathLike[str] | BinaryWriter, *, origin: tuple[float, float, float]
+) -> ExtractResult:
+    """Write level 0 of a file with splats as a file of its own, with another origin; values are preserved bit for bit.
+
+    Args:
+        file: an open `.csplat` file.
+        output: as in `extract`.
+        origin: the origin of the new file; the means remain as they are.
+
+    Raises:
+        FormatError, StoreError, OSError: as in `extract`.
+    """
+    header = replace(file.header, coarse_tiles=(), origin=origin)
+    return _write_extract(file.window(), header, header.tiles, (), output, kept_chunks=_KEPT_WITH_ALL)
+
+
 def _write_extract(
     window: FileWindow,
     header: SceneHeader,
     tiles: Sequence[Tile],
     nodes: Sequence[Node],
     output: str | os.PathLike[str] | BinaryWriter,
+    kept_chunks: Sequence[bytes] = _KEPT,
 ) -> ExtractResult:
     """Write some tiles of a file as a file of their own.
 
@@ -104,6 +124,7 @@ def _write_extract(
         tiles: tiles of level 0 to write, in file order.
         nodes: nodes of the file.
         output: a path or an open binary file.
+        kept_chunks: types of the chunks to write that belong to no tile, besides codebooks.
     """
     kept = _kept_nodes(nodes, {tile.index for tile in tiles}) if header.coarse_tiles else []
     tiles = [tile for number in kept for tile in nodes[number].tiles] if kept else tiles
@@ -111,7 +132,7 @@ def _write_extract(
     records = [
         record
         for record in header.directory
-        if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in codebook_ids)
+        if record.type in kept_chunks or (record.type == _spec.CHUNK_CODEBOOK and record.id in codebook_ids)
     ]
     copies = TileCopier(window)
     copied = [copies.of(tile) for tile in tiles]

@@ -68,7 +68,7 @@ def convert_axes(scene: Scene, axes: str) -> Scene:
         scene: the scene.
         axes: directions of +x, +y and +z, three letters.
     """
-    matrix = _rotation_to(scene.metadata, axes)
+    matrix = rotation_to_axes(scene.metadata, axes)
 
     def transform_block(model: SplatModel) -> SplatModel:
         turned = rotate_scene(model, matrix)
@@ -180,7 +180,7 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     return replace(model, means=means.astype(np.float32), means_double=doubles, metadata=metadata)
 
 
-def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
+def rotation_to_axes(metadata: SceneMetadata, axes: str) -> F64:
     """Return the matrix, [3, 3], that takes a scene to the target axes.
 
     For a scene without axes, the default axes are assumed. If its up direction is known, the result is tilted so that

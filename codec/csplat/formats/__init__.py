@@ -280,7 +280,7 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: 
     if file_format.write is None:
         raise InputError(f"{target.name} would be {file_format.title}, which csplat does not write")
     statistics = _clamp_statistics()
-    scenes = [statistics.watch(scene.with_sh_degree(file_format.degree), file_format.ranges) for scene in levels]
+    scenes = [_watched(scene, file_format, statistics) for scene in levels]
     if file_format.write_levels is not None and file_format.takes_levels(target):
         findings = file_format.write_levels(target, scenes)
     elif len(scenes) != 1:
@@ -295,7 +295,7 @@ def survey_losses(levels: Sequence[Scene], format: str) -> list[Finding]:
     file_format = format_by_name(format)
     statistics = _clamp_statistics()
     for scene in levels if file_format.ranges else ():
-        for _ in statistics.watch(scene.with_sh_degree(file_format.degree), file_format.ranges).blocks():
+        for _ in () if file_format.keeps(scene) else _watched(scene, file_format, statistics).blocks():
             pass
     return [*_lost_contents(file_format, levels), *_clamped_values(file_format, levels, statistics)]
 
@@ -305,6 +305,13 @@ def _clamp_statistics() -> ClampStatistics:
     from csplat.formats.common import ClampStatistics  # imported lazily: reading does not load the encoder
 
     return ClampStatistics()
+
+
+def _watched(scene: Scene, file_format: Format, statistics: ClampStatistics) -> Scene:
+    """Return a scene as a format stores it, whose values are counted if the format may clamp them."""
+    if file_format.keeps(scene):
+        return scene
+    return statistics.watch(scene.with_sh_degree(file_format.degree), file_format.ranges)
 
 
 def _lost_contents(file_format: Format, levels: Sequence[Scene]) -> list[Finding]:
@@ -430,7 +437,7 @@ def _own_formats() -> dict[str, Format]:
     from csplat.formats import compressed_ply, gltf, ksplat, sog, splat, spz
 
     built_in = [compressed_ply.FORMAT, _PLY_FORMAT, _CSPLAT_FORMAT, spz.FORMAT, spz.FORMAT_4]
-    built_in += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
+    built_in += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT, gltf.COMPRESSED_FORMAT]
     return {file_format.name: file_format for file_format in built_in}
 
 

@@ -59,6 +59,7 @@ class Format:
         open_level: opens a level of detail; `None`: scenes have only one level.
         open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands.
         write: writes a file; `None`: csplat does not write the format.
+        keeps: returns True if `write` copies the splats of a scene from its file without a change.
         write_levels: writes all levels of detail to a file of the name `levels_name`; `None`: one level only.
         levels_name: name of files with levels, in lower case; "" if there are none.
         doubt: for formats identified by the file name alone: returns the reason why the content is unlikely to be of
@@ -78,6 +79,7 @@ class Format:
     open_level: OpenLevel | None = None
     open_bands: OpenBands | None = None
     write: WriteScene | None = None
+    keeps: Callable[[Scene], bool] = lambda _scene: False
     write_levels: WriteLevels | None = None
     levels_name: str = ""
     doubt: Callable[[Path], str] = lambda _path: ""
@@ -104,6 +106,8 @@ class Format:
 
     def expected_bytes(self, scene: Scene) -> int | None:
         """Return the approximate size of a file; `None` if it depends on the scene."""
+        if self.keeps(scene):
+            return scene.size_bytes
         return round(scene.count * self.splat_bytes[min(scene.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, scene: Scene) -> tuple[str, ...]:

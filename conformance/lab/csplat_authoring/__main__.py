@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: CC0-1.0
-"""Write the vectors, the manifest, `spec/example.md` and `conformance/CLAUSES.md`.
+"""Write the vectors, the manifest, `spec/example.md`, `conformance/CLAUSES.md` and the assets of csplat in glTF.
 
 Usage:
     python -m csplat_authoring           # write outdated files, remove files without a recipe
@@ -19,6 +19,7 @@ from typing import Any
 
 from csplat import _spec
 from csplat_authoring.clauses import clause_map, specification
+from csplat_authoring.gltf_assets import gltf_assets
 from csplat_authoring.recipe import Recipe
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected
@@ -27,6 +28,8 @@ from csplat_conformance.manifest import VECTORS, Vector, load, picture_name, sum
 from csplat_conformance.reference_renders import psnr, read_png, reference_render, write_png
 
 _ROOT = Path(__file__).parents[3]
+#: Folder of the assets of csplat in glTF.
+ASSETS = Path(__file__).parents[2] / "gltf"
 
 _SAME_PICTURE = 60.0  # dB; one of 16 values differs by 1
 
@@ -40,7 +43,7 @@ def main() -> int:
     check = args.check
     generated = files(renders=args.renders)
     stale = [path for path, data in generated.items() if not path.exists() or path.read_bytes() != data]
-    found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png")])
+    found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png"), *ASSETS.glob("*.glb")])
     extra = [path for path in found if path not in generated]
     if not check:
         for path in stale:
@@ -72,6 +75,7 @@ def files(*, renders: bool = False) -> dict[Path, bytes]:
             raise SystemExit(f"two recipes have the name {vector.file}")
         result[path] = data
         vectors.append(vector)
+    result |= {ASSETS / name: data for name, data in gltf_assets().items()}
     result[VECTORS / "manifest.json"] = to_json(vectors).encode()
     result[_ROOT / "spec" / "example.md"] = worked_example().encode()
     result[_ROOT / "conformance" / "CLAUSES.md"] = clause_map(specification(), vectors).encode()

@@ -31,6 +31,7 @@ def convert(
     drop_floaters: Annotated[bool, typer.Option("--drop-floaters", help="Drop splats far from others.")] = False,
     up: shared.Up = None,
     sh_degree: shared.ShDegree = None,
+    compress: Annotated[bool, typer.Option("--compress", help="Compress the splats of a .glb.")] = False,
     no_loss: Annotated[bool, typer.Option("--no-loss", help="Refuse if anything would be lost.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report losses and size, write nothing.")] = False,
     to_axes: Annotated[
@@ -57,7 +58,10 @@ def convert(
     the axes of IN, or of --to-axes. Some formats have fixed axes, such as y
     up in glTF. A line reports what the format cannot hold. For .csplat files,
     `csplat encode` has presets and targets. A new folder with a file
-    lod-meta.json gets streamed SOG, with all levels of detail.
+    lod-meta.json gets streamed SOG, with all levels of detail. --compress
+    makes a .glb about 15 times smaller: its splats are a .csplat file, as the
+    extension CSPLAT_gaussian_splatting_compression_1 specifies. IN is copied
+    bit for bit if it is a .csplat file, and encoded otherwise.
 
     Formats, their highest SH degree, and what else they hold (header: axes,
     origin, unit, metadata, antialiased, flat, colour space):
@@ -70,12 +74,14 @@ def convert(
       ksplat          .ksplat          read         2
       sog             .sog, meta.json  read, write  3  antialiased, flat
       gltf            .glb, .gltf      read, write  3  header
+      gltf-csplat     .csplat.glb      read, write  3  header, extra, cameras
       checkpoint      .pt, .ckpt       read         4
 
     Examples:
       csplat convert scene.spz scene.ply
       csplat convert scene.ply scene.sog --drop-floaters
       csplat convert scene.ply small.spz --sh-degree 1 --crop 0,0,0,3
+      csplat convert scene.csplat scene.glb --compress
       csplat convert city.csplat city/lod-meta.json
     """
     out = Output(force, report, as_json, quiet)
@@ -84,6 +90,11 @@ def convert(
     filters, overrides = _parse_filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
     filters = replace(filters, drop_floaters=drop_floaters, sh_degree=shared.parse_sh_degree(sh_degree))
     chosen, max_splats = shared.parse_level(level)
+    if compress:
+        if write_as is not None or Path(output).suffix.lower() != ".glb":
+            what = f"--to is {write_as}" if write_as is not None else f"OUT is {output}"
+            raise typer.BadParameter(f"--compress compresses the splats of a .glb, but {what}")
+        write_as = "gltf-csplat"
     folder = Path(output).parent
     is_new_folder = Path(output).name in FOLDER_NAMES and not folder.exists()
     if not dry_run and not Path(output).is_dir():

@@ -27,6 +27,9 @@ from csplat.types import F32, F64
 
 JsonPath = tuple[str | int, ...]  # path of a value in the JSON, for example ("nodes", 3, "mesh")
 
+EXTENSION = "KHR_gaussian_splatting"
+#: Directions of +x, +y and +z: left, up, front.
+AXES = "LUF"
 MAGIC = b"glTF"
 GLB_HEAD = struct.Struct("<4sII")  # magic, version, file size
 _CHUNK_HEAD = struct.Struct("<I4s")
@@ -325,12 +328,12 @@ class GltfDocument:
     def _transform(self, node: dict[str, Any], json_path: JsonPath) -> F64:
         """Return the matrix [4, 4] of a node, from its `matrix` or its rotation, scale and translation."""
         if "matrix" in node:
-            return self._numbers(node, json_path, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+            return self.numbers(node, json_path, "matrix", np.eye(4).ravel()).reshape(4, 4).T
         matrix = np.eye(4)
-        quat = self._numbers(node, json_path, "rotation", (0.0, 0.0, 0.0, 1.0)).tolist()
+        quat = self.numbers(node, json_path, "rotation", (0.0, 0.0, 0.0, 1.0)).tolist()
         matrix[:3, :3] = self._rotation(quat, (*json_path, "rotation"))
-        matrix[:3, :3] *= self._numbers(node, json_path, "scale", (1.0, 1.0, 1.0))
-        matrix[:3, 3] = self._numbers(node, json_path, "translation", _NO_TRANSLATION)
+        matrix[:3, :3] *= self.numbers(node, json_path, "scale", (1.0, 1.0, 1.0))
+        matrix[:3, 3] = self.numbers(node, json_path, "translation", _NO_TRANSLATION)
         return matrix
 
     def _rotation(self, quat: list[float], json_path: JsonPath) -> list[list[float]]:
@@ -345,13 +348,23 @@ class GltfDocument:
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
 
-    def _numbers(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: Any) -> F64:
+    def numbers(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: Any) -> F64:
         """Return a list of numbers, float64, as many as the default has; raise an `InputError` for anything else."""
         values = holder.get(key, list(default))
         good = isinstance(values, list) and len(values) == len(default)
         if not good or not all(type(value) in (int, float) and abs(value) < _NUMBER_MAX for value in values):
             raise self.error((*json_path, key), f"found {_shorten(values)}, expected {len(default)} numbers")
         return np.array(values, np.float64)
+
+
+def sh_names(degree: int) -> list[str]:
+    """Return the attribute names of an SH band, without the prefix."""
+    return [f"SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
+
+
+def attribute_name(name: str) -> str:
+    """Return the name of a splat attribute with its prefix; POSITION has none."""
+    return name if name == "POSITION" else f"{EXTENSION}:{name}"
 
 
 def open_document(path: Path) -> GltfDocument:

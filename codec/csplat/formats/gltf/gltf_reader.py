@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read splats from glTF: accessors of KHR_gaussian_splatting, or SPZ under any name that its extension has had.
+"""Read splats from glTF: accessors of KHR_gaussian_splatting, a .csplat file (`spec/gltf.md`), or SPZ under any name
+that its extension has had.
 
 Everything that splats do not use (meshes, materials, their compression) is ignored, even required extensions.
 
@@ -26,23 +27,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.editing.transform import axes_rotation, rotate_scene, sphere_lattice, stretch_scene
+from csplat.editing.transform import (
+    axes_rotation,
+    rotate_scene,
+    sphere_lattice,
+    stretch_scene,
+    translate_scene,
+)
 from csplat.errors import InputError, counted
 from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales, log_scales
-from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
+from csplat.formats.gltf.csplat_payload import (
+    COMPRESSION,
+    check_primitive,
+    open_payload,
+    payload_bounds,
+    payload_matrix,
+    payload_view,
+)
+from csplat.formats.gltf.gltf_document import (
+    AXES,
+    EXTENSION,
+    Accessor,
+    GltfDocument,
+    JsonPath,
+    PlacedPrimitive,
+    attribute_name,
+    open_document,
+    sh_names,
+)
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
-from csplat.scene import BLOCK_SPLATS, Scene
+from csplat.scene import BLOCK_SPLATS, Scene, join_blocks
 from csplat.scene_metadata import LICENCE, LINEAR, SRGB, SceneMetadata
 from csplat.spherical_harmonics import SH_C0, evaluate_sh
+from csplat.splat_file import SplatFile
 from csplat.types import F32, F64
 
-#: Directions of +x, +y and +z: left, up, front.
-AXES = "LUF"
-EXTENSION = "KHR_gaussian_splatting"
 #: Names of the extension that packs splats as SPZ, and of its predecessors.
 _SPZ = (
     "KHR_gaussian_splatting_compression_spz_2",
@@ -64,19 +87,44 @@ _UNPACKED_RATIO = 1032  # maximum expansion by deflate; exceeded if several view
 
 
 @dataclass(frozen=True)
+class _Splats:
+    """The splats of a primitive, in its coordinates.
+
+    Attributes:
+        count: N.
+        empty: a model without splats; it may have fewer SH bands than the scene.
+        parts: yields rows and a function that decodes them to a model, for all splats in order.
+        metadata: a model without splats with the origin and metadata of a .csplat file; `None` for other primitives.
+    """
+
+    count: int
+    empty: SplatModel
+    parts: Callable[[], Iterator[tuple[slice, Callable[[], SplatModel]]]]
+    metadata: SplatModel | None = None
+
+    @classmethod
+    def of_rows(cls, decode: Callable[[slice], SplatModel], count: int) -> _Splats:
+        """Return the splats that a function decodes from any rows."""
+
+        def parts() -> Iterator[tuple[slice, Callable[[], SplatModel]]]:
+            for start in range(0, count, BLOCK_SPLATS):
+                rows = slice(start, min(start + BLOCK_SPLATS, count))
+                yield rows, partial(decode, rows)
+
+        return cls(count, decode(slice(0, 0)), parts)
+
+
+@dataclass(frozen=True)
 class _Instance:
     """The splats of a primitive, placed by a node.
 
     Attributes:
-        decode: returns a model of some splats in the primitive's coordinates; it may have fewer SH bands than the
-            scene.
-        count: N.
+        splats: the splats.
         linear: [3, 3], linear part of the node's transform.
         translation: [3], translation of the node.
     """
 
-    decode: Callable[[slice], SplatModel]
-    count: int
+    splats: _Splats
     linear: F64
     translation: F64
 
@@ -95,6 +143,7 @@ class _GltfReading:
         antialiased: the flag of each SPZ.
         linear_samples: functions that decode some splats of each primitive with linear colours.
         packed: SPZ by index of their buffer views.
+        files: .csplat files by index of their buffer views.
     """
 
     file: GltfDocument
@@ -110,6 +159,7 @@ class _GltfReading:
     antialiased: list[bool] = field(default_factory=list)
     linear_samples: list[Callable[[], SplatModel]] = field(default_factory=list)
     packed: dict[int, SpzArrays] = field(default_factory=dict)
+    files: dict[int, SplatFile] = field(default_factory=dict)
     count: int = 0
     unpacked_bytes: int = 0
 
@@ -122,28 +172,34 @@ class _GltfReading:
         packed = next((name for name in _SPZ if name in within or name in extensions), "")
         if EXTENSION not in extensions and not packed:
             return
-        unknown = [name for name in within if name not in _SPZ]
+        unknown = [name for name in within if name not in {COMPRESSION, *_SPZ}]
         unknown += [name for name in extensions if name in self.required and name not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
             raise self.file.error(json_path, f"the splats use {', '.join(map(str, unknown))}, which is not supported")
-        self._check(placed, extension, (*json_path, EXTENSION), packed=bool(packed))
-        if packed:
+        has_file = COMPRESSION in within
+        self._check(placed, extension, (*json_path, EXTENSION), packed=bool(packed) and not has_file)
+        bad = infinite = 0
+        if has_file:
+            splats = self._payload(placed)
+        elif packed:
             inner = (*json_path, packed) if packed in extensions else (*json_path, EXTENSION, "extensions", packed)
             holder = within if packed in within else extensions
             view = self.file.integer(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
-            block, count = self._packed_block(placed, view, draft="kernel" not in extension)
-            bad = infinite = 0
+            splats = _Splats.of_rows(*self._packed_block(placed, view, draft="kernel" not in extension))
         else:
             block, count, (bad, infinite) = self._plain_block(placed)
+            splats = _Splats.of_rows(block, count)
+        count = splats.count
         if extension.get("colorSpace") == LINEAR:
-            self.linear_samples.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
-            block = partial(_decode_in_srgb, block)
+            self.linear_samples.append(partial(_sample, splats))
+            splats = _in_srgb(splats)
         for matrix in self.file.instances(placed):
             self.count += count
             self.statistics.nonfinite += bad
             self.infinite += infinite
             # A small file could reference a mesh very often.
-            if self.count > self.file.size() + sum(arrays.count for arrays in self.packed.values()):
+            unpacked = sum(arrays.count for arrays in self.packed.values())
+            if self.count > self.file.size() + unpacked + sum(one.count for one in self.files.values()):
                 shown = f"shows at least {counted(self.count, 'splat')}, more than it has bytes"
                 raise InputError(f"{self.file.path.name} {shown}")
             linear, translation = matrix[:3, :3], matrix[:3, 3]
@@ -152,7 +208,7 @@ class _GltfReading:
             largest = lengths.max()
             if not _STRETCHES[0] < largest < _STRETCHES[1] or lengths.min() < _SINGULAR * largest:
                 raise self.file.error(placed.json_path, "the transform of its node is singular or exceeds float32")
-            yield _Instance(block, count, linear, translation)
+            yield _Instance(splats, linear, translation)
 
     def _report(self, finding: Finding) -> None:
         """Add a finding; findings with the same text about several primitives are added up."""
@@ -186,7 +242,7 @@ class _GltfReading:
         attributes = file.get(placed.primitive, placed.json_path, "attributes", dict, {})
 
         def array(name: str, width: int) -> Accessor:
-            key = name if name == "POSITION" else f"{EXTENSION}:{name}"
+            key = attribute_name(name)
             if key not in attributes:
                 raise file.error(json_path, f"there is no {key}")
             return file.accessor(attributes[key], width)
@@ -239,6 +295,33 @@ class _GltfReading:
         return count_huge_rows(
             scales, *(accessor.values(rows)[kept] for name, accessor in arrays.items() if name.startswith("SH_"))
         )
+
+    def _payload(self, placed: PlacedPrimitive) -> _Splats:
+        """Return the splats of a primitive that are a .csplat file in a buffer view, which is opened once.
+
+        Raises:
+            FormatError, UnsupportedError, LimitError: as in `csplat.open` of a .csplat file.
+            InputError: the primitive violates a clause of `spec/gltf.md`.
+        """
+        view = payload_view(self.file, placed)
+        if view not in self.files:
+            self.files[view] = open_payload(self.file, view)
+            self.antialiased.append(self.files[view].metadata.antialiased)
+        opened = self.files[view]
+        check_primitive(self.file, placed, opened.header, payload_bounds(opened))
+        matrix = payload_matrix(opened.header.coordinate_system)
+        plain = SceneMetadata(antialiased=opened.metadata.antialiased, flat=opened.metadata.flat)
+
+        def turned(model: SplatModel) -> SplatModel:
+            return rotate_scene(replace(model, origin=(0.0, 0.0, 0.0), metadata=plain), matrix)
+
+        def parts() -> Iterator[tuple[slice, Callable[[], SplatModel]]]:
+            start = 0
+            for model in opened.models():
+                yield slice(start, start + len(model)), partial(turned, model)
+                start += len(model)
+
+        return _Splats(opened.count, turned(opened.empty()), parts, rotate_scene(opened.empty(), matrix))
 
     def _packed_block(
         self, placed: PlacedPrimitive, view: int, *, draft: bool
@@ -323,33 +406,53 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         raise InputError(f"{path.name} shows no splats: no mesh of its scene has {EXTENSION}")
     _conclude(reading)
     try:
-        comments = _read_comments(file)
-        origin = np.array(comments.origin or (0.0, 0.0, 0.0))
-        if comments.origin is None and np.abs(instances[0].translation).max() >= _FAR:
-            origin = instances[0].translation
-        x, y, z = origin.tolist()
-        degree = max(instance.decode(slice(0, 0)).sh_degree for instance in instances)
-        empty = _pad_bands(instances[0].decode(slice(0, 0)), degree)
-        antialiased = comments.metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
-        metadata = replace(comments.metadata, coordinate_system=AXES, antialiased=antialiased)
-        if metadata.colour_space == LINEAR:
-            metadata = replace(metadata, colour_space=SRGB)  # `_decode_in_srgb`
-        empty = replace(empty, origin=(x, y, z), metadata=metadata)
+        empty = _describe_scene(reading, instances)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
     def blocks() -> Iterator[SplatModel]:
         for instance in instances:
-            for start in range(0, instance.count, BLOCK_SPLATS):
-                rows = slice(start, min(start + BLOCK_SPLATS, instance.count))
+            for rows, decode in instance.splats.parts():
                 try:
-                    block = instance.decode(rows)
+                    block = decode()
                     if len(block):
-                        yield _place_block(_pad_bands(block, degree), instance, empty)
+                        yield _place_block(_pad_bands(block, empty.sh_degree), instance, empty)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
     yield Scene.like(empty, reading.count - reading.statistics.nonfinite, blocks, reading.findings)
+
+
+def _describe_scene(reading: _GltfReading, instances: list[_Instance]) -> SplatModel:
+    """Return a model without splats that has everything else of the scene.
+
+    The metadata of a .csplat file is that of the scene if nothing else is shown.
+
+    Raises:
+        InputError: the metadata is not valid.
+    """
+    comments = _read_comments(reading.file)
+    first, metadata = instances[0], comments.metadata
+    payload = first.splats.metadata
+    origin = np.array(comments.origin or (0.0, 0.0, 0.0))
+    has_origin = payload is not None and any(payload.origin)  # which the node has, too (GLT-10)
+    if comments.origin is None and (has_origin or np.abs(first.translation).max() >= _FAR):
+        origin = first.translation
+    x, y, z = origin.tolist()
+    extras = [{name: column.dtype for name, column in one.splats.empty.extra.items()} for one in instances]
+    empty = _pad_bands(first.splats.empty, max(one.splats.empty.sh_degree for one in instances))
+    if any(extra != extras[0] for extra in extras):
+        empty = replace(empty, extra={})
+    if payload is not None and len(instances) == 1:
+        placed = stretch_scene(payload, first.linear)
+        dx, dy, dz = (first.translation - origin).tolist()
+        metadata = translate_scene(placed, (dx, dy, dz)).metadata
+        metadata = replace(metadata, unit_metres=None if metadata.unit_metres is None else 1.0)
+    antialiased = metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
+    metadata = replace(metadata, coordinate_system=AXES, antialiased=antialiased)
+    if metadata.colour_space == LINEAR:
+        metadata = replace(metadata, colour_space=SRGB)  # `_in_srgb`
+    return replace(empty, origin=(x, y, z), metadata=metadata)
 
 
 def _conclude(reading: _GltfReading) -> None:
@@ -387,11 +490,6 @@ def _conclude(reading: _GltfReading) -> None:
         text = f"colours are linear ({LINEAR}): fitted to sRGB, rms error {error:.2f} of 255 steps"
         text += "; overlapping splats blend in linear light there, and in sRGB here"
         reading.findings.append(Finding("linear-colours", reading.count, text, "repair"))
-
-
-def sh_names(degree: int) -> list[str]:
-    """Return the attribute names of an SH band, without the prefix."""
-    return [f"SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
 def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.bool_] | None, float]:
@@ -445,9 +543,26 @@ def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: in
     )
 
 
-def _decode_in_srgb(block: Callable[[slice], SplatModel], rows: slice) -> SplatModel:
-    """Decode some splats of linear colours, and fit their SH to sRGB."""
-    return fit_srgb(block(rows))
+def _in_srgb(splats: _Splats) -> _Splats:
+    """Return splats of linear colours with SH that are fitted to sRGB when they are decoded."""
+
+    def parts() -> Iterator[tuple[slice, Callable[[], SplatModel]]]:
+        for rows, decode in splats.parts():
+            yield rows, partial(_decode_in_srgb, decode)
+
+    return replace(splats, parts=parts)
+
+
+def _decode_in_srgb(decode: Callable[[], SplatModel]) -> SplatModel:
+    """Decode splats of linear colours, and fit their SH to sRGB."""
+    return fit_srgb(decode())
+
+
+def _sample(splats: _Splats) -> SplatModel:
+    """Return about `_SAMPLE` splats, spread over all blocks."""
+    every = max(1, splats.count // _SAMPLE)
+    blocks = (decode() for _, decode in splats.parts())
+    return join_blocks(splats.empty, [block.select(slice(None, None, every)) for block in blocks])
 
 
 def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
@@ -464,7 +579,8 @@ def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> S
     if offset.any():
         with np.errstate(over="ignore"):
             block = replace(block, means=(block.means.astype(np.float64) + offset).astype(np.float32))
-    return replace(block, origin=empty.origin, metadata=empty.metadata)
+    extra = block.extra if empty.extra else {}
+    return replace(block, origin=empty.origin, metadata=empty.metadata, extra=extra)
 
 
 def _read_comments(file: GltfDocument) -> CommentMetadata:
