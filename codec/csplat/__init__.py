@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from csplat.scene_metadata import SceneMetadata
     from csplat.splat_file import SplatFile
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 __all__ = [
     "Context",

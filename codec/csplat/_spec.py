@@ -8,8 +8,8 @@ from __future__ import annotations
 import struct
 from typing import Final, NamedTuple
 
-VERSION_MAJOR: Final = 0
-VERSION_MINOR: Final = 4
+VERSION_MAJOR: Final = 1
+VERSION_MINOR: Final = 0
 MEDIA_TYPE: Final = "model/vnd.csplat"
 EXTENSION: Final = ".csplat"
 MAGIC: Final = b"\x93\x43\x53\x50\x0d\x0a\x1a\x0a"

@@ -57,7 +57,7 @@ export function readFileHeader(bytes, levelMax = HIGHEST_LEVEL) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const header = spec.unpackHeader(view, 0);
   const { version_major: major, version_minor: minor, profile, index_size: indexSize } = header;
-  if (major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR) {
+  if (major !== spec.VERSION_MAJOR || minor > spec.VERSION_MINOR) {
     const ours = `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`;
     const detail = `the file has version ${major}.${minor}, this decoder reads ${ours}`;
     throw fault(spec.ERROR_VERSION, AT.version_major, 'HDR-2', detail);

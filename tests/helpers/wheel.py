@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-0.1.0-py3-none-linux_x86_64.whl out/wheel`.
+"""Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-1.0.0-py3-none-linux_x86_64.whl out/wheel`.
 
 The folder then comes first on PYTHONPATH, so that tests see what users install, in the one environment that there is.
 Modification times follow from contents, so that bytecode stays valid.

@@ -131,7 +131,7 @@ def test_completes_commands_and_options_and_corrects_misspelt_ones(monkeypatch, 
 def test_csplat_as_a_module_is_the_program_and_prints_its_version():
     done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
     assert printed("--version") == done.stdout
-    assert done.stdout.startswith(f"csplat {csplat.__version__}, format 0.4")
+    assert done.stdout.startswith(f"csplat {csplat.__version__}, format 1.0")
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
     text, before = project.read_bytes(), tomllib.loads(project.read_text("utf-8"))
     assert 1 == prepared("v9.9.9", "https://github.com/owner/csplat")
     with pytest.raises(SystemExit):
-        prepared("v0.1.0", "git@github.com:owner/csplat")
+        prepared("v1.0.0", "git@github.com:owner/csplat")
     assert text == project.read_bytes()
     for url in ("https://github.com/first/csplat", "https://github.com/second/csplat"):  # twice: links are replaced
         assert 0 == prepared(f"v{csplat.__version__}", url)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prepare the packages of a release: check the tag, and write the address of the repository into their metadata.
 
-The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v0.1.0 URL=https://…`
+The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v1.0.0 URL=https://…`
 calls this before it builds. npm accepts a provenance only if `repository` in package.json is where it was built.
 
-    python tools/release/prepare.py --tag v0.1.0 --url https://github.com/OWNER/NAME
+    python tools/release/prepare.py --tag v1.0.0 --url https://github.com/OWNER/NAME
 """
 
 from __future__ import annotations

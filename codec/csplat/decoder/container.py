@@ -265,7 +265,7 @@ def read_file_header(view: memoryview, level_max: str = HIGHEST_LEVEL) -> _spec.
         instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
         detail = "a PLY, which csplat.read reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
-    if (header.version_major, header.version_minor) != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
+    if header.version_major != _spec.VERSION_MAJOR or header.version_minor > _spec.VERSION_MINOR:
         raise UnsupportedError(
             f"version {header.version_major}.{header.version_minor}"
             f" (this decoder reads {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR})",

@@ -163,9 +163,9 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     if magic != _spec.MAGIC:
         log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")
         return None
-    if record.version_major != _spec.VERSION_MAJOR or record.version_minor != _spec.VERSION_MINOR:
+    if record.version_major != _spec.VERSION_MAJOR or record.version_minor > _spec.VERSION_MINOR:
         expected = f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}"
-        message = f"{record.version_major}.{record.version_minor}, expected {expected}"
+        message = f"{record.version_major}.{record.version_minor}, expected at most {expected}"
         log.add_field("HDR-2", header, "version_major", message)
         return None
     end = _spec.HEADER_OFFSETS["header_crc"]

@@ -48,8 +48,8 @@ class Mask(NamedTuple):
 
 
 RANGES: Final[tuple[Range, ...]] = (
-    Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
-    Range("header", "version_minor", "", 4, 4, "HDR-2", "E_VERSION"),
+    Range("header", "version_major", "", 1, 1, "HDR-2", "E_VERSION"),
+    Range("header", "version_minor", "", 0, 0, "HDR-2", "E_VERSION"),
     Range("index_head", "head_size", "", 68, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "attribute_size", "", 16, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "codebook_size", "", 12, 255, "IDX-8", "E_VALUE"),

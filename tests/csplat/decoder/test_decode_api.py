@@ -270,7 +270,7 @@ def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
 def test_errors_of_version_and_crc_name_the_stored_and_expected_values():
     data = bytearray(RICH)
     data[8:12] = struct.pack("<HH", 3, 7)
-    assert re.search(r"E_VERSION.*3\.7.*reads 0\.4", str(refusal(data)))
+    assert re.search(r"E_VERSION.*3\.7.*reads 1\.0", str(refusal(data)))
     data = bytearray(RICH)
     data[16] ^= 1
     computed = zlib.crc32(data[:28])

@@ -70,16 +70,12 @@ def decoder(
     filters: Annotated[
         list[str] | None, typer.Option("--filter", metavar="PATTERN", help="Names 'invalid/*', clauses 'HDR-*'.")
     ] = None,
-    by: Annotated[
+    classes: Annotated[
         str,
         typer.Option(
-            "--class", metavar="CLASS", show_default=False, help="Tolerance: exact, renderer. Default: exact."
+            "--class", metavar="CLASS", show_default=False, help="exact or renderer, resource level. Default: exact,C."
         ),
-    ] = EXACT,
-    resource_level: Annotated[
-        str,
-        typer.Option(metavar="A|B|C", show_default=False, help="Highest resource level it accepts. Default: C."),
-    ] = HIGHEST_LEVEL,
+    ] = f"{EXACT},{HIGHEST_LEVEL}",
     jobs: _Jobs = None,
     timeout: _Timeout = None,
     junit: _Junit = None,
@@ -92,13 +88,14 @@ def decoder(
     """Test a decoder with the test vectors.
 
     L1: header and errors. L2: integers. L3: floats, bit for bit, or within
-    the tolerance of --class renderer (spec 9.2). L4: images of a command with
-    {camera}. L5: tiles of cuts through the levels of detail, and of boxes, of
-    a command with {cuts}. --cmd can be repeated. Without it, csplat's own decoder is
-    tested. Otherwise a decoder writes its results to {outdir}, or exits with
-    status 1 and a line of JSON with the error code:
-    conformance/IMPLEMENTERS.md explains how. If everything passes, the last line
-    says what the decoder may claim.
+    the tolerance of --class renderer (spec 9.2). A decoder of --class A or B
+    must refuse files of higher resource levels (8.1). L4: images of a command
+    with {camera}. L5: tiles of cuts through the levels of detail, and of
+    boxes, of a command with {cuts}. --cmd can be repeated. Without it,
+    csplat's own decoder is tested. Otherwise a decoder writes its results to
+    {outdir}, or exits with status 1 and a line of JSON with the error code:
+    conformance/IMPLEMENTERS.md explains how. If everything passes, the last
+    line says what the decoder may claim.
 
     Examples:
       csplat conformance decoder --filter 'invalid/*'
@@ -116,10 +113,11 @@ def decoder(
     # The commands that are given select the default: a renderer alone is tested at L4 alone.
     more = [str(number) for number, given in ((RENDERS, render_program), (CUTS, cut_program)) if given is not None]
     levels = shared.checked(parse_levels, level or ",".join(["1", "2", "3", *more]))
+    by, resource_level = (",".join(chosen) for chosen in _by_length(classes.split(",")))
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or TIMEOUT_SECONDS
     options = shared.checked(
-        DecoderSuiteOptions, _join_patterns(names), _join_patterns(clauses), levels, timeout=seconds, jobs=jobs, by=by,
-        resource_level=resource_level,
+        DecoderSuiteOptions, _join_patterns(names), _join_patterns(clauses), levels, timeout=seconds, jobs=jobs,
+        by=by or EXACT, resource_level=resource_level or HIGHEST_LEVEL,
     )  # fmt: skip
     with out.bar() as bar:
         if not programs:
@@ -127,6 +125,12 @@ def decoder(
         else:
             result = run_command(program, options, render=render_program, cuts=cut_program, progress=_bar_mover(bar))
     _publish(result, out, junit, "no vector is chosen")
+
+
+def _by_length(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the words of several characters, and those of one, which are letters of resource levels."""
+    stripped = [word.strip() for word in words]
+    return [word for word in stripped if len(word) != 1], [word for word in stripped if len(word) == 1]
 
 
 def _sort_commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
