@@ -27,6 +27,7 @@ from typing import Any, BinaryIO, TypeVar
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
 
 _SHARE = 0.5  # fraction of the free memory that a command uses; the rest is for other programs
+_STATUS_OF_SIGNAL = 128  # exit status of a process that a signal ends, apart from the number of the signal
 _UNKNOWN = 4 << 30  # bytes assumed if the system does not report its memory
 #: Files with limit and usage of the control group, versions 2 and 1.
 _LIMITS = (
@@ -170,6 +171,46 @@ def interrupts_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def interrupts_noted(*numbers: int) -> Iterator[list[int]]:
+    """Note signals in a list, and raise them only at the end: callbacks and destructors swallow KeyboardInterrupt.
+
+    A second signal acts at once.
+
+    Args:
+        numbers: the signals; default: SIGINT.
+
+    Yields:
+        Numbers of the signals that arrived.
+
+    Raises:
+        KeyboardInterrupt: SIGINT arrived.
+        SystemExit: another signal arrived; the status is that of a process that it ends.
+    """
+    noted = list[int]()
+    # Only the main thread can set a handler. None is a handler that was not set from Python, and cannot be restored.
+    usual = {number: signal.getsignal(number) for number in numbers or (signal.SIGINT,)}
+    if threading.current_thread() is not threading.main_thread():
+        usual = {}
+    usual = {number: handler for number, handler in usual.items() if handler not in (None, signal.SIG_IGN)}
+
+    def note(number: int, _: object) -> None:
+        noted.append(number)
+        signal.signal(number, usual[number])
+
+    for number in usual:
+        signal.signal(number, note)
+    try:
+        yield noted
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+    if signal.SIGINT in noted:
+        raise KeyboardInterrupt
+    if noted:
+        raise SystemExit(_STATUS_OF_SIGNAL + noted[0])
 
 
 def available_memory_bytes() -> int:

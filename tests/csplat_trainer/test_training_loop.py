@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
+from csplat_trainer.fitter import Fitter
 from csplat_trainer.image_gains import ImageGain, ImageGains
 from csplat_trainer.initial_splats import measure_extent, place_splats
 from csplat_trainer.losses import PhotometricLoss
@@ -206,6 +208,32 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
     again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("again", "further"))
     assert first == again
     assert first != further  # another scene: the existing tuning does not apply
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_a_checkpoint_beside_the_output_from_which_the_run_ends_as_if_uninterrupted(
+    file_runs, tmp_path, monkeypatch
+):
+    whole, part = tmp_path / "whole.ply", tmp_path / "part.ply"
+    words, left = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30), tmp_path / "part.ply.npz"
+    call("train", file_runs.data, whole, *words)
+    step = Fitter.step
+
+    def interrupted(fitter, fit):
+        step(fitter, fit)
+        if fitter.iteration == 17:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Fitter, "step", interrupted)
+        messages = call("train", file_runs.data, part, *words, status=130).stderr
+    assert f"{left} holds the finished steps: --resume {left} continues from them" in messages
+    assert {whole, left} == {*tmp_path.iterdir()}
+    assert 17 == load_checkpoint(left).iteration
+    assert "is left from an interrupted run" in call("train", file_runs.data, part, *words, status=1).stderr
+    call("train", file_runs.data, part, *words, "--resume", left)
+    assert whole.read_bytes() == part.read_bytes()
+    assert {whole, part} == {*tmp_path.iterdir()}
 
 
 @pytest.mark.slow

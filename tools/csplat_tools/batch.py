@@ -46,7 +46,7 @@ from csplat.file_source import read_bytes
 from csplat.formats import formats
 from csplat.out_of_core.bucket_workers import open_client
 from csplat.remote_store import is_url
-from csplat.system import interrupts_held, split_words
+from csplat.system import interrupts_held, interrupts_noted, split_words
 from csplat_render.kernels import thread_count
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
@@ -155,7 +155,7 @@ def run_batch(
     sizes = {task: path.stat().st_size for task in tasks if (path := Path(task.source)).is_file()}
     todo = deque(sorted(tasks, key=lambda task: -sizes.get(task, 0)))  # the largest first
     running: dict[Future[SceneResult], tuple[Any, Task]] = {}
-    with nullcontext() if scheduler is None else open_client(scheduler) as client, _interrupts_noted() as interrupts:
+    with nullcontext() if scheduler is None else open_client(scheduler) as client, interrupts_noted() as interrupts:
         new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker)
         idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
         try:
@@ -215,24 +215,6 @@ def _end_processes(processes: Collection[Any], outputs: Sequence[Path]) -> None:
         process.join()
         for output in outputs:
             remove_unfinished(output, process.pid or 0)
-
-
-@contextmanager
-def _interrupts_noted() -> Iterator[list[int]]:
-    """Note interrupts in a list, and raise KeyboardInterrupt only at the end: callbacks and destructors swallow it."""
-    noted = list[int]()  # numbers of the signals
-    handler = signal.getsignal(signal.SIGINT)
-    # Only the main thread can set a handler. None is a handler that was not set from Python, and cannot be restored.
-    if threading.current_thread() is not threading.main_thread() or handler in (None, signal.SIG_IGN):
-        yield noted
-        return
-    signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
-    try:
-        yield noted
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    if noted:
-        raise KeyboardInterrupt
 
 
 def _begin_worker() -> None:

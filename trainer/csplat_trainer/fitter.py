@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,6 +15,7 @@ from typing import Any, Protocol
 from numpy.random import PCG64, Generator
 
 from csplat.errors import InputError
+from csplat.system import interrupts_noted
 from csplat.types import F32
 from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.fit_checkpoint import FitCheckpoint, Kind, save_checkpoint
@@ -21,6 +25,7 @@ from csplat_trainer.parameters import Parameters
 from csplat_trainer.tuned_scene import RateTerm
 
 COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
+_SAVING = 20.0  # minimum ratio of the time between checkpoints to the time that writing one takes
 _MOST_PENDING = 20  # losses to be read at once; reading a loss lets a GPU wait for the next step
 
 
@@ -57,7 +62,7 @@ class Fit(Protocol):
         ...
 
     def after_step(self) -> None:
-        """Do what is due after the step: refine, validate, report, write a checkpoint."""
+        """Do what is due after the step: refine, validate, report."""
         ...
 
 
@@ -129,14 +134,33 @@ class Fitter:
             ),
         )  # fmt: skip
 
-    def run(self, fit: Fit) -> None:
-        """Make the remaining steps."""
-        while self.iteration < self.iterations and not self.has_ended:
-            self.iteration += 1
-            self.step(fit)
-            fit.after_step()
-        self._read_losses()
-        self.log["seconds"] = self.seconds
+    def run(self, fit: Fit, save: Callable[[], None] | None = None, *, every: float = 0.0) -> None:
+        """Make the remaining steps, and write checkpoints: by time, at the end, and if a signal interrupts the run.
+
+        Args:
+            fit: the values to fit.
+            save: writes a checkpoint of the state between two steps; `None`: there are none.
+            every: time between checkpoints, seconds; longer if writing them would take more than a twentieth of it.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: SIGINT or SIGTERM arrived. With checkpoints, the step was completed, and a
+                checkpoint written.
+        """
+        wait, saved = every, time.perf_counter()
+        with nullcontext(list[int]()) if save is None else interrupts_noted(signal.SIGINT, signal.SIGTERM) as signals:
+            while self.iteration < self.iterations and not self.has_ended and not signals:
+                self.iteration += 1
+                self.step(fit)
+                fit.after_step()
+                now = time.perf_counter()
+                if save is not None and now - saved >= wait:
+                    save()
+                    saved = time.perf_counter()
+                    wait = max(every, _SAVING * (saved - now))
+            self._read_losses()
+            self.log["seconds"] = self.seconds
+            if save is not None:
+                save()
 
     def step(self, fit: Fit) -> None:
         """Make a step on the next image of the queue, which is filled in random order when it is empty."""

@@ -15,8 +15,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -177,6 +178,16 @@ class ScreenGradients:
     def clear(self, splats: int) -> None:
         """Start anew, for another number of splats."""
         self.total, self.count = np.zeros(splats), np.zeros(splats, np.int64)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a checkpoint."""
+        return {"screen_total": self.total, "screen_count": self.count}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the state of a checkpoint, unless it has none or is of another number of splats."""
+        total, count = arrays.get("screen_total"), arrays.get("screen_count")
+        if total is not None and count is not None and total.shape == self.total.shape == count.shape:
+            self.total, self.count = total.astype(np.float64), count.astype(np.int64)
 
     def add(self, norms: F32, drawn: NDArray[np.bool_]) -> None:
         """Add the norms of a render, for the splats that it shows."""

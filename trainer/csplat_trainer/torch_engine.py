@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.random import Generator
+from numpy.typing import NDArray
 from torch import Tensor
 
 from csplat.types import F32, F64
@@ -125,6 +127,15 @@ class _DeviceScreenGradients(ScreenGradients):
     def clear(self, splats: int) -> None:
         """Start anew, for another number of splats."""
         self._sums = torch.zeros((2, splats), device=self._device)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        total, count = self._sums.cpu().numpy()
+        return {"screen_total": total, "screen_count": count}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        total, count = arrays.get("screen_total"), arrays.get("screen_count")
+        if total is not None and count is not None and total.shape == count.shape == self._sums.shape[1:]:
+            self._sums = torch.from_numpy(np.stack([total, count]).astype(np.float32)).to(self._device)
 
     def add_render(self, render: TorchRender, camera: Camera) -> None:
         """Add the gradients of a render, in units of half an image."""

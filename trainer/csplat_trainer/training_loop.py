@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 import csplat
 from csplat.context import DEFAULT_CONTEXT, Context
@@ -34,7 +35,7 @@ from csplat_trainer.losses import PendingLoss, PerceptualLoss
 from csplat_trainer.parameters import ParameterArrays, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
 from csplat_trainer.strategies import densify, grow, prune_least_needed, relocate, reset_opacities
-from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult, uses_torch
+from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult, save_to, uses_torch
 from csplat_trainer.training_report import peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -118,16 +119,19 @@ class _Training:
         self._log = self._fitter.log
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
+        arrays: Mapping[str, NDArray[Any]] = {}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._place_splats(self._scene))
             self._log["growth"] = options.growth_from(len(parameters))
         else:
-            parameters = self._resume(outputs.resume)
+            parameters, arrays = self._resume(outputs.resume)
         self._lpips = _load_lpips_weights(options, outputs)
         extent_factor = min(1.0, _LARGE_EXTENT / self._scene.extent)
         self._engine = _make_engine(
             parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips, context
         )
+        if self._engine.screen is not None:
+            self._engine.screen.restore(arrays)
         self._colour = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._colour, np.float32)
 
@@ -136,9 +140,7 @@ class _Training:
         options, first = self._options, self._fitter.iteration
         if first and not any(map(options.prunings_left, range(first + 1, options.iterations + 1))):
             self._prune_late()
-        self._fitter.run(self)
-        if self._outputs.checkpoint is not None:
-            self._save()
+        self._fitter.run(self, save_to(self._outputs, self._save), every=self._outputs.checkpoint_seconds)
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
@@ -163,8 +165,6 @@ class _Training:
             self._evaluate(options.eval_views)
         if outputs.preview_due(fitter.iteration, fitter.iterations):
             self._preview()
-        if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
-            self._save()
 
     @property
     def _degree(self) -> int:
@@ -195,8 +195,8 @@ class _Training:
             colours=data.points_rgb,
         )
 
-    def _resume(self, path: str | Path) -> Parameters:
-        """Set the fitter to the state of a checkpoint, and return its parameters, adapted to the options.
+    def _resume(self, path: str | Path) -> tuple[Parameters, Mapping[str, NDArray[Any]]]:
+        """Set the fitter to the state of a checkpoint; return its parameters, adapted to the options, and its arrays.
 
         Raises:
             InputError: the file is damaged or of another kind.
@@ -211,7 +211,7 @@ class _Training:
         if shift.any():  # the data set has another origin, since its cameras differ
             means = checkpoint.parameters.values["means"]
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
-        return fit_to_options(checkpoint.parameters, self._options, self._fitter.rng)
+        return fit_to_options(checkpoint.parameters, self._options, self._fitter.rng), checkpoint.arrays
 
     def _training_image(self, number: int) -> PosedImage:
         """Return a training image, in the first steps at half its size if requested; halved images are kept."""
@@ -312,12 +312,12 @@ class _Training:
         rendered = self._engine.render(image.camera, self._background, self._degree)
         save_image(folder / f"{self._fitter.iteration:06d}.png", side_by_side(target, rendered))
 
-    def _save(self) -> None:
-        """Write a checkpoint; `outputs.checkpoint` must not be `None`."""
-        assert self._outputs.checkpoint is not None
+    def _save(self, path: str | Path) -> None:
+        """Write a checkpoint."""
+        screen = self._engine.screen
         self._fitter.save(
-            self._outputs.checkpoint, "train", asdict(self._options), self._engine.parameters.on_cpu(),
-            own={"origin": self._data.origin},
+            path, "train", asdict(self._options), self._engine.parameters.on_cpu(),
+            own={"origin": self._data.origin}, arrays={} if screen is None else screen.state(),
         )  # fmt: skip
 
     def _model(self) -> SplatModel:

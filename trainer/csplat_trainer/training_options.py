@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -272,8 +274,9 @@ class Outputs:
     """Files that a run reads and writes, other than its data set.
 
     Attributes:
-        checkpoint: file for checkpoints (each replaces the last), or `None`.
-        checkpoint_every: steps between checkpoints; 0: only at the end.
+        checkpoint: file for checkpoints (each replaces the last), which SIGINT and SIGTERM write, too; or `None`.
+        checkpoint_seconds: time between checkpoints, longer if writing one takes more than a twentieth of it; 0: a
+            checkpoint after each step.
         previews: folder for previews (image and render side by side), or `None`.
         preview_every: steps between previews; 0: after 100, 200, 400, … steps and at the end.
         resume: checkpoint to continue from, or `None`.
@@ -281,7 +284,7 @@ class Outputs:
     """
 
     checkpoint: str | Path | None = None
-    checkpoint_every: int = 0
+    checkpoint_seconds: float = 60.0
     previews: str | Path | None = None
     preview_every: int = 0
     resume: str | Path | None = None
@@ -296,6 +299,11 @@ class Outputs:
         if self.preview_every:
             return iteration % self.preview_every == 0
         return iteration % 100 == 0 and (iteration // 100).bit_count() == 1
+
+
+def save_to(outputs: Outputs, save: Callable[[str | Path], None]) -> Callable[[], None] | None:
+    """Return a function that writes the checkpoint of a run by `save`; `None` if it has none."""
+    return None if outputs.checkpoint is None else partial(save, outputs.checkpoint)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ csplat_trainer.tuning.tuning_options.
 import json
 import math
 import re
+import signal
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -99,18 +100,18 @@ def test_the_same_seed_gives_the_same_bytes_at_any_number_of_threads():
 
 
 @pytest.mark.parametrize("share", [None, pytest.param(0.9, marks=pytest.mark.slow)], ids=["fixed lambda", "size"])
-def test_a_killed_run_resumes_as_if_uninterrupted(tmp_path, share):
+def test_an_ended_run_resumes_as_if_uninterrupted(tmp_path, share):
     fixed = coarse() if share is None else fixed_by(replace(COARSE, shape_codebook_size=32))
     size_bytes = None if share is None else int(share * len(written(fixed, fixed.start())))
     file, options = tmp_path / "c.npz", replace(FEW, lr_exposure=0.01)
     run = partial(tune, fixed, views_of_source(), options, size_bytes=size_bytes)
 
-    def kill(now):
+    def interrupt(now):
         if now.iteration == 8:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGTERM)
 
-    with pytest.raises(KeyboardInterrupt):
-        run(on_step=kill, outputs=Outputs(file, 3))
+    with pytest.raises(SystemExit, match=str(128 + signal.SIGTERM)):
+        run(on_step=interrupt, outputs=Outputs(file, 1e9))
     whole, rest = run(), run(outputs=Outputs(resume=file))
     assert written(fixed, whole.best_values) == written(fixed, rest.best_values)
     for name in ("losses", "validations", "exposures", "byte_cost"):
@@ -330,7 +331,7 @@ def test_a_tuned_file_that_is_too_large_is_tuned_from_a_smaller_draft(stub_tuner
 
 @pytest.mark.slow
 def test_the_command_resumes_and_scores_nothing_without_test_images(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("csplat_tools.cli.shared_options.CHECKPOINT_EVERY", 4)
+    monkeypatch.setattr("csplat_trainer.training_options.Outputs.checkpoint_seconds", 0.0)
     change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", test_every=0)
     monkeypatch.setattr(tuning_run, "default_validation_count", lambda *_, **__: 2)
     run = tmp_path / "run.npz"

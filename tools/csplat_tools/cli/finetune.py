@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Annotated
 
 import typer
@@ -49,7 +50,8 @@ def finetune(
     --data or --self is required: values are tuned through the encoder's
     quantisers until renders of the file match the images, or the renders of
     the scene itself. Targets choose the number of splats and lambda. Requires
-    the render extra.
+    the render extra. An interrupted run leaves OUT.csplat.npz, from which
+    --resume continues, except with --target-psnr.
 
     Examples:
       csplat finetune scene.ply scene.csplat --data capture --preset small
@@ -87,7 +89,8 @@ def finetune(
         named["--checkpoint"] = checkpoint
     out.check(output, inputs=(source, *views.inputs, resume), named=named)
     check_name(output, ".csplat", "finetune", source)
-    with out.bar() as progress:
+    kept = nullcontext() if target_psnr is not None else shared.run_checkpoint(checkpoint, resume, output)
+    with kept as path, out.bar() as progress:
         scene = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
         out.print_findings(scene.findings)
         model = scene.model()
@@ -95,7 +98,7 @@ def finetune(
         view_set = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=validation_count)
         view_set.read_images()
         result = tuning.run_finetuning(
-            model, view_set, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
+            model, view_set, output, encoding, options, Outputs(path, resume=resume),
             target=target, source_index=source_index, page=page,
             context=Context(progress=progress), quiet=out.quiet,
         )  # fmt: skip

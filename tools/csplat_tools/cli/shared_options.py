@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import typer
@@ -24,7 +26,8 @@ from csplat.scene_metadata import Direction, check_axes, unit_up
 from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
-from csplat_tools.console import NUMBER, print_data
+from csplat_tools.console import NUMBER, note, print_data
+from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.level_builder import LEVELS_MAX, LevelCount
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
@@ -32,7 +35,6 @@ from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_s
 T = TypeVar("T")
 N = TypeVar("N", int, float, int | None, float | None)
 
-CHECKPOINT_EVERY = 1_000  # steps from one checkpoint to the next
 _LEVEL = re.compile(r"(\d{1,15}(?:\.\d{1,15})?)(k|M)?", re.ASCII)
 _LEVEL_MAX = 255  # largest level that the format has; larger numbers are numbers of splats
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}  # metres
@@ -123,7 +125,8 @@ Keep = Annotated[float | None, _keep]
 HiddenKeep = Annotated[float | None, hidden(_keep)]
 Page = Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")]
 Checkpoint = Annotated[
-    str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Write checkpoints. Default: none.")
+    str | None,
+    typer.Option(metavar="FILE.npz", hidden=True, help="Checkpoints, one a minute. Default: OUT.npz, removed."),
 ]
 Resume = Annotated[
     str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
@@ -421,6 +424,40 @@ def check_range(option: str, value: N, low: float, high: float) -> N:
 def is_same_file(a: str | None, b: str | None) -> bool:
     """Return True if two paths are given and lead to the same place."""
     return a is not None and b is not None and resolve_links(a) == resolve_links(b)
+
+
+@contextmanager
+def run_checkpoint(
+    checkpoint: str | None, resume: str | None, output: str, others: Callable[[str], Sequence[Path]] = lambda _: ()
+) -> Iterator[str | None]:
+    """Yield the path of a run's checkpoint: that of --checkpoint, or OUT.npz, which only an interrupted run leaves.
+
+    Args:
+        checkpoint, resume: the options.
+        output: the file that the run writes.
+        others: returns the paths of further checkpoints of the run, from that of the first.
+
+    Raises:
+        InputError: an interrupted run has left OUT.npz, and --resume does not name it.
+    """
+    path = checkpoint if checkpoint is not None or output == STANDARD_STREAM else f"{output}.npz"
+    if path is None:
+        yield None
+        return
+    is_own = checkpoint is None
+    if is_own and Path(path).exists() and not is_same_file(path, resume):
+        raise InputError(f"{path} is left from an interrupted run: continue with --resume {path}, or remove it")
+    is_over = True
+    try:
+        yield path
+    except (KeyboardInterrupt, SystemExit, OSError, MemoryError):
+        is_over = not Path(path).exists()
+        if not is_over:
+            note(f"{path} holds the finished steps: --resume {path} continues from them")
+        raise
+    finally:
+        for file in (Path(path), *others(path)) if is_own and is_over else ():
+            file.unlink(missing_ok=True)
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:

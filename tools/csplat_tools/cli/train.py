@@ -77,6 +77,7 @@ def train(
     by `csplat finetune`, with --preset, --keep or a target. To make files of
     several sizes, train once with --checkpoint, then use --resume (--help-all
     shows both). With --trust-paths, DATA may name files outside of its folder.
+    An interrupted run leaves OUT.npz, from which --resume continues.
 
     Examples:
       csplat train lego lego.ply --max-splats 10000
@@ -116,10 +117,10 @@ def train(
     out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
-    files = Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume)
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
-    with out.bar() as progress:
-        context = Context(seed=seed, progress=progress)
+    kept = shared.run_checkpoint(checkpoint, resume, output, lambda path: [tuning_checkpoint(path)])
+    with kept as path, out.bar() as progress:
+        files, context = Outputs(path, resume=resume), Context(seed=seed, progress=progress)
         if to_file:
             result = run_training_to_file(
                 data, output, options, files, encoding, tuning_after(training=options), target=target,

@@ -195,7 +195,7 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     resumes from. Otherwise the run makes another file from the same training.
     """
     checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
-    outputs = Outputs(checkpoint, files.checkpoint_every)
+    outputs = Outputs(checkpoint, files.checkpoint_seconds)
     if files.resume is None or checkpoint is None or not checkpoint.exists():
         return outputs
     is_same = resolve_links(str(files.checkpoint)) == resolve_links(files.resume)

@@ -26,7 +26,7 @@ from csplat_trainer.fitter import COUNT_EVERY, FitStep, Fitter
 from csplat_trainer.image_gains import ImageGain
 from csplat_trainer.losses import PendingLoss
 from csplat_trainer.parameters import Parameters
-from csplat_trainer.training_options import Outputs, uses_torch
+from csplat_trainer.training_options import Outputs, save_to, uses_torch
 from csplat_trainer.training_report import peak_memory
 from csplat_trainer.tuned_scene import RateTerm
 from csplat_trainer.tuning.tuning_engine import CpuTuning, TuningEngine
@@ -167,9 +167,7 @@ class _Tuning:
         """Make the remaining steps, and return the best values."""
         if self._best is None:
             self._validate()
-        self._fitter.run(self)
-        if self._outputs.checkpoint is not None:
-            self._save(self._outputs.checkpoint)
+        self._fitter.run(self, save_to(self._outputs, self._save), every=self._outputs.checkpoint_seconds)
         assert self._best is not None
         return TuningResult(self._best.values, self._full_log())
 
@@ -186,15 +184,13 @@ class _Tuning:
         return value
 
     def after_step(self) -> None:
-        fitter, options, outputs = self._fitter, self._options, self._outputs
+        fitter, options = self._fitter, self._options
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
         if fitter.is_due(options.log_every) or fitter.is_last:
             model = self._fixed.encode_plan.model
             size_bytes = self._log["validations"][-1]["size_bytes"]
             self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
-        if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
-            self._save(outputs.checkpoint)
 
     @property
     def _byte_cost(self) -> float:
