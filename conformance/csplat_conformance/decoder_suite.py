@@ -141,7 +141,7 @@ def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgr
         return outcomes
 
     vectors = _select_vectors(options)
-    return _make_report("csplat's decoder", map(run, vectors), len(vectors), options, progress)
+    return _make_report("csplat's decoder", map(run, vectors), len(vectors), options, progress, options.claim)
 
 
 def _own_cuts(vector: Vector) -> Answer:
@@ -201,7 +201,8 @@ def run_command(
     if command is None:
         vectors = [v for v in vectors if (render and v.views) or (cuts and cuts_of_vector(v))]
     with ThreadPoolExecutor(options.jobs or os.cpu_count() or 1) as pool:
-        return _make_report(command or render or cuts or "", pool.map(run, vectors), len(vectors), options, progress)
+        results, claim = pool.map(run, vectors), "" if command is None else options.claim
+        return _make_report(command or render or cuts or "", results, len(vectors), options, progress, claim)
 
 
 def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:
@@ -237,6 +238,7 @@ def _make_report(
     vector_count: int,
     options: DecoderSuiteOptions,
     progress: CountProgress | None,
+    claim: str,
 ) -> ConformanceReport:
     """Collect the outcomes of each vector as they arrive, report progress, and check CHK-7 over all of them."""
     outcomes: list[Outcome] = []
@@ -247,4 +249,4 @@ def _make_report(
     outcomes, notes = check_payload_consistency(outcomes)
     if options.by != EXACT:
         notes.append(f"compared with the tolerances of the class {options.by}")
-    return ConformanceReport("decoder", subject, outcomes, notes, claim=options.claim)
+    return ConformanceReport("decoder", subject, outcomes, notes, claim=claim)

@@ -258,6 +258,8 @@ def test_cuts_are_requested_of_valid_files_with_levels_alone(faulty, faulty_cuts
     chosen = {"pattern": "valid/quats,valid/levels,invalid/level_below", "levels": (1, 5)}
     alone = run_command(None, DecoderSuiteOptions(**chosen), cuts=faulty_cuts("lines"))
     assert [("valid/levels", "L5")] == [(one.name, one.level) for one in alone.outcomes]
+    complete = DecoderSuiteOptions()  # L1 to L3, of which a command for cuts shows nothing
+    assert "" == run_command(None, complete, cuts=faulty_cuts("lines")).claim
     skipped = [one for one in faulty("refusal", **chosen).outcomes if one.status is Status.SKIPPED]
     assert [("valid/levels", "no command for cuts was given")] == [(one.name, one.message) for one in skipped]
 

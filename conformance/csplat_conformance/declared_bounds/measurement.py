@@ -94,14 +94,17 @@ class Source:
         return replace(first, **arrays, extra=extra)
 
     def to_model(self, origin: tuple[float, float, float]) -> SplatModel:
-        """Return a model to render: centres in float32 relative to a file's origin, SH degree 4 at most."""
+        """Return a model to render: centres in float32 relative to a file's origin, SH degree 4 at most.
+
+        Scales beyond ±88, which include the logarithm of 0, are those that count (5.5).
+        """
         near = self.about(origin)
         with np.errstate(over="ignore"):  # SplatModel refuses values beyond float32
             means = near.means.astype(np.float32)
         return SplatModel(
             means,
             self.quats,
-            self.scales,
+            np.clip(self.scales, -_LOG_SCALE_MAX, _LOG_SCALE_MAX),
             self.opacities,
             self.sh0,
             np.ascontiguousarray(self.shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]),

@@ -92,7 +92,7 @@ def test_our_encoder_passes_at_other_presets(preset):
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "decibels", "names"), [
     ("fast", 34, "ordinary/degree_3"),
-    ("balanced", 34, "ordinary/degree_3,ordinary/needles_and_discs"),
+    ("balanced", 34, "ordinary/degree_3,ordinary/needles_and_discs,nasty/infinite_scales"),
     ("small", 31, "ordinary/degree_3"),
 ])  # fmt: skip
 def test_our_encoder_keeps_the_picture(preset, decibels, names):
