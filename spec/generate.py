@@ -583,8 +583,9 @@ def enum_table(enum: Registry) -> str:
     extra = [name for name, _, _, _ in enum_tables(enum) if name not in ("names", "reserved")]
     # Names that repeat the ids, as those of error codes do, need no column.
     named = any(entry["name"] not in str(entry["id"]).lower() for entry in enum["entries"])
+    key = "mask" if enum["name"].endswith("_flag") else "id"
     lines = [
-        "| id | " + "name | " * named + "".join(f"{name.replace('_', ' ')} | " for name in extra) + "meaning |",
+        f"| {key} | " + "name | " * named + "".join(f"{name.replace('_', ' ')} | " for name in extra) + "meaning |",
         "|---|" + "---|" * (named + len(extra) + 1),
     ]
     for entry in enum["entries"]:

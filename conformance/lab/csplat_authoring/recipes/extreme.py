@@ -198,7 +198,12 @@ def _streams() -> list[Recipe]:
 def _texts() -> list[Recipe]:
     deepest = b'{"a":' + b"[" * 63 + b"]" * 63 + b"}"
     number = b'{"n":0.' + b"1" * 5000 + b"}"
-    long_number = Stream(1, _RUNS)
+    long_number, zeros = Stream(1, _RUNS), b"0" * 10500
+    exponents = b'{"n":[1%se-10500,0.%s1e10501,0%se99999999999999999999,1e-99999999999999999999]}' % (
+        zeros,
+        zeros,
+        b".0",
+    )
     other = b'{"a":{"a":1},"A":"\\ud83d\\ude00","\\u0000":-0.0e-0,"\xc3\xa9":1e308}'
 
     def meta(name: str, why: str, text: bytes, stream_coding: Stream = PLAIN) -> Recipe:
@@ -208,6 +213,7 @@ def _texts() -> list[Recipe]:
     return [
         meta("json_64_deep", "the deepest nesting that is allowed", deepest),
         meta("json_long_number", "a number of 5,000 digits is valid JSON", number, long_number),
+        meta("json_long_exponents", "digits and exponents that cancel: all of them are 1 or 0", exponents, long_number),
         meta("json_odd", "white space, escapes, U+0000, minus zero, a large number", b" \t\r\n" + other + b"\n"),
         _extreme(
             "declared_errors_none",

@@ -36,6 +36,11 @@ _BAD: Final = {
     "number_tie": (b'{"a":[1.7976931348623158e308,1.797693134862315808e308]}', "just beyond what rounds to binary64"),
     "number_tie_negative": (b'{"a":-1.797693134862315808e+308}', "the same below 0"),
     "number_tie_integer": (b'{"a":1797693134862315808' + b"0" * 290 + b"}", "the same without a point"),
+    "number_long_exponent": (
+        b'{"a":0.' + b"0" * 10500 + b"1e10810}",
+        "10^309, in digits and an exponent that partly cancel",
+    ),
+    "number_huge_exponent": (b'{"a":1e99999999999999999999}', "an exponent beyond 64 bits"),
     "name_bare": (b"{a:1}", "a name without quotation marks"),
     "name_number": (b"{1:1}", "a number in the place of a name"),
     "name_unopened": (b'{a":1}', "a name without its first quotation mark"),
