@@ -9,7 +9,7 @@ near each decoded splat.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -75,15 +75,21 @@ def rows_input(
     separation: float = SEPARATION,
     renders: bool = True,
     psnr_min: float = PSNR_MIN,
+    origin: tuple[float, float, float] | None = None,
 ) -> EncoderInput:
-    """Return an input with the given rows; encoders may refuse it if its name begins with `nasty/`."""
+    """Return an input with the given rows; encoders may refuse it if its name begins with `nasty/`.
+
+    With an origin, the header has the comment `csplat origin`, and the centres are relative to it.
+    """
     kept = cache(splats)
+    if origin is not None:
+        layout = PlyLayout(comments=(f"csplat origin {' '.join(map(repr, origin))}",))
     may_refuse = name.startswith("nasty/")
     return EncoderInput(
         name,
         why,
         lambda: write_ply(kept(), layout),
-        lambda: source_of_rows(kept()),
+        lambda: replace(source_of_rows(kept()), origin=origin or (0.0, 0.0, 0.0)),
         separation,
         may_refuse,
         renders,
@@ -129,6 +135,7 @@ def ordinary_inputs() -> list[EncoderInput]:
         rows_input(
             "ordinary/comments", "comments that name axes and more", few, PlyLayout(comments=("up is Y", "", "x" * 300))
         ),
+        rows_input("ordinary/origin", "a comment with the origin of the centres", few, origin=(4.5e6, -1e7, 12.25)),
         rows_input(
             "ordinary/obj_info", "obj_info lines, which are like comments", few, PlyLayout(obj_info=("num 64", ""))
         ),
