@@ -113,6 +113,8 @@ def test_quiet_and_nested_displays_show_nothing_and_durations_are_short():
         assert (outer, null_progress) == (inner, silent)
     with progress_bar() as later:
         assert later not in (null_progress, outer)  # the first display went with its work
-    assert ["0 s", "99 s", "2 minutes"] == [console.format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
+    durations = {0.2: "0 s", 99.4: "99 s", 110.0: "2 minutes", 24116.0: "6 h 42 min"}
+    assert durations == {seconds: console.format_seconds(seconds) for seconds in durations}
     ranges = {(20.0, 50.0): "20 to 50 s", (30.0, 110.0): "1 to 2 minutes", (120.0, 290.0): "2 to 5 minutes"}
+    ranges |= {(5400.0, 14000.0): "1.5 to 3.9 h"}
     assert ranges == {between: console.format_range(*between) for between in ranges}

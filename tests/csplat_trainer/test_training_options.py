@@ -45,7 +45,7 @@ def test_progress_log_and_previews_are_written(data, tmp_path):
     seen, previews = [], tmp_path / "p"
     outputs = Outputs(previews=previews, preview_every=30)
     result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
-    assert [20, 40, 60] == [now.iteration for now in seen]
+    assert [2, 10, 20, 30, 40, 60] == [now.iteration for now in seen]
     assert ["000030.png", "000060.png"] == sorted(path.name for path in previews.iterdir())
     assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
     log = json.loads(json.dumps(result.log, allow_nan=False))

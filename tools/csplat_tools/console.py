@@ -33,6 +33,7 @@ _RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
 _STAGES = 2  # stages shown at a time: the last that were reported
 _WORKING = "working"  # shown if no stage is known
 _MINUTES_FROM = 100.0  # seconds; longer durations are given in minutes
+_HOURS_FROM = 100  # minutes; longer durations are given in hours
 
 #: Regular expression of a number, with one group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
@@ -225,8 +226,11 @@ def format_bytes(size_bytes: int) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """Format a duration, rounded: `12 s`, `3 minutes`."""
-    return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
+    """Format a duration, rounded: `12 s`, `3 minutes`, `1 h 12 min`."""
+    if seconds < _MINUTES_FROM:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    return f"{minutes} minutes" if minutes < _HOURS_FROM else f"{minutes // 60} h {minutes % 60} min"
 
 
 def format_estimate(seconds: float) -> str:
@@ -235,10 +239,12 @@ def format_estimate(seconds: float) -> str:
 
 
 def format_range(least: float, most: float) -> str:
-    """Format a range of durations: `20 to 50 s`, `2 to 5 minutes`."""
+    """Format a range of durations: `20 to 50 s`, `2 to 5 minutes`, `1.5 to 4.0 h`."""
     if most < _MINUTES_FROM:
         return f"{least:.0f} to {most:.0f} s"
-    return f"{max(1.0, least / 60.0):.0f} to {most / 60.0:.0f} minutes"
+    if most < 60.0 * _HOURS_FROM:
+        return f"{max(1.0, least / 60.0):.0f} to {most / 60.0:.0f} minutes"
+    return f"{least / 3600.0:.1f} to {most / 3600.0:.1f} h"
 
 
 _displays: list[Display] = []  # the display that is shown; at most one

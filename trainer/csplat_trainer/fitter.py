@@ -25,6 +25,7 @@ from csplat_trainer.parameters import Parameters
 from csplat_trainer.tuned_scene import RateTerm
 
 COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
+_FIRST_REPORTS = (2, 10, 30)  # steps
 _SAVING = 20.0  # minimum ratio of the time between checkpoints to the time that writing one takes
 _MOST_PENDING = 20  # losses to be read at once; reading a loss lets a GPU wait for the next step
 
@@ -189,6 +190,10 @@ class Fitter:
     def gain(self, view: int, rate: float) -> ImageGain | None:
         """Return the correction of an image, to be trained at a learning rate; `None` if that is 0."""
         return ImageGain(self.gains, view, rate) if rate else None
+
+    def report_is_due(self, every: int) -> bool:
+        """Return True after every Nth step, the last, and some of the first, from which times are estimated."""
+        return self.is_last or self.is_due(every) or self.iteration in _FIRST_REPORTS
 
     def is_due(self, every: int) -> bool:
         """Return True after every Nth step; never for 0."""

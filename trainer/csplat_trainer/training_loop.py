@@ -159,7 +159,7 @@ class _Training:
             self._refine()
         if prunings_left := options.prunings_left(fitter.iteration):
             self._prune(prunings_left)
-        if fitter.is_due(options.log_every) or fitter.is_last:
+        if fitter.report_is_due(options.log_every):
             self._report()
         if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
             self._evaluate(options.eval_views)

@@ -20,7 +20,7 @@ from csplat.model import SplatModel
 from csplat.types import U8
 from csplat_render.metrics import Distance
 from csplat_tools import html_report as html
-from csplat_tools.console import format_bytes, format_table
+from csplat_tools.console import format_bytes, format_seconds, format_table
 from csplat_tools.file_streams import write_bytes
 from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.file_description import bytes_by_attribute
@@ -176,8 +176,8 @@ def describe_step(now: FitStep) -> str:
     size = "" if now.size_bytes is None else f", {format_bytes(now.size_bytes)}"
     return (
         f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
-        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}{size}, {now.seconds:.0f} s,"
-        f" {now.seconds_left:.0f} s left"
+        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}{size}, {format_seconds(now.seconds)},"
+        f" {format_seconds(now.seconds_left)} left"
     )
 
 

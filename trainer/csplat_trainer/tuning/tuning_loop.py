@@ -187,7 +187,7 @@ class _Tuning:
         fitter, options = self._fitter, self._options
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
-        if fitter.is_due(options.log_every) or fitter.is_last:
+        if fitter.report_is_due(options.log_every):
             model = self._fixed.encode_plan.model
             size_bytes = self._log["validations"][-1]["size_bytes"]
             self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
