@@ -40,6 +40,7 @@ _BAD: Final = {
         b'{"a":0.' + b"0" * 10500 + b"1e10810}",
         "10^309, in digits and an exponent that partly cancel",
     ),
+    "number_310": (b'{"a":1e310}', "10^310"),
     "number_huge_exponent": (b'{"a":1e99999999999999999999}', "an exponent beyond 64 bits"),
     "name_bare": (b"{a:1}", "a name without quotation marks"),
     "name_number": (b"{1:1}", "a number in the place of a name"),
