@@ -109,11 +109,11 @@ fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, rea
 fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what it finds for the others; needs clang
 	@mkdir -p out/fuzz/c/corpus
 	$(CLANG) $(FUZZED) -DCSPLAT_NO_ZLIB codec/c/fuzz/fuzz.c codec/c/inflate.c -lm -o out/fuzz/c/fuzz
-	out/fuzz/c/fuzz -max_total_time=600 -max_len=8000 -timeout=10 -artifact_prefix=out/fuzz/c/ out/fuzz/c/corpus \
+	out/fuzz/c/fuzz -max_total_time=600 -max_len=16000 -timeout=10 -artifact_prefix=out/fuzz/c/ out/fuzz/c/corpus \
 		$(wildcard conformance/csplat_conformance/vectors/*/)
 	@mkdir -p out/fuzz/inflate
 	$(CLANG) $(FUZZED) codec/c/fuzz/inflate.c -lz -o out/fuzz/inflate/fuzz
-	out/fuzz/inflate/fuzz -max_total_time=60 -max_len=4000 -artifact_prefix=out/fuzz/inflate/
+	out/fuzz/inflate/fuzz -max_total_time=120 -max_len=2000 -artifact_prefix=out/fuzz/inflate/
 	$(BIN)/python conformance/lab/fuzz.py --target others --replay out/fuzz/c/corpus
 
 clean: ## remove what the commands above made

@@ -336,7 +336,7 @@ static int read_otherwise(csplat *file)
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
-    static const csplat_options small = {5000, 8000000, 100000, NULL, NULL, NULL, NULL};
+    static const csplat_options small = {5000, 8000000, 100000, 0, NULL, NULL, NULL, NULL};
     csplat_source source = {read_bytes, NULL, 0};
     csplat *file, *other;
     csplat_scene *scene;

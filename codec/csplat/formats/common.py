@@ -245,7 +245,8 @@ def _clamped_sizes(name: str, stored: ValueRange, clamped: RangeStatistics) -> s
         return ""
     ends = [(clamped.most, stored.high)] if clamped.above else []
     ends += [(clamped.least, stored.low)] if clamped.below else []
-    sizes = (f"{np.exp(np.float64(value)):.3g} becomes {np.exp(np.float64(end)):.3g}" for value, end in ends)
+    with np.errstate(over="ignore"):  # a size beyond float64 is shown as inf
+        sizes = [f"{np.exp(np.float64(value)):.3g} becomes {np.exp(np.float64(end)):.3g}" for value, end in ends]
     return f" (a size of {', one of '.join(sizes)} scene units)"
 
 

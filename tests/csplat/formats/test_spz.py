@@ -177,6 +177,13 @@ def test_values_beyond_the_range_are_clipped(tmp_path, make_model):
     np.testing.assert_allclose(found.sh0[0, :2], [0.5 / 0.15, -0.5 / 0.15], rtol=1e-6)
 
 
+def test_a_size_beyond_float64_is_reported(tmp_path, make_model):
+    model = make_model(1, scales=np.array([[710, 0, 0]], "f4"))
+    findings = csplat.write(tmp_path / "a.spz", model)
+    (text,) = (one.text for one in findings if one.attribute == "scales")
+    assert "(a size of inf becomes 379 scene units)" in text
+
+
 def test_the_step_of_positions_fits_splats_and_extent(tmp_path, make_model):
     def bits(reach, scale):
         means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
