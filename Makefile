@@ -115,6 +115,10 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 	$(CLANG) $(FUZZED) codec/c/fuzz/inflate.c -lz -o out/fuzz/inflate/fuzz
 	out/fuzz/inflate/fuzz -max_total_time=60 -max_len=4000 -artifact_prefix=out/fuzz/inflate/
 	$(BIN)/python conformance/lab/fuzz.py --target others --replay out/fuzz/c/corpus
+	@mkdir -p out/fuzz/encode/corpus
+	$(CLANG) $(FUZZED) -DCSPLAT_NO_ZLIB codec/c/fuzz/encode.c $(filter-out codec/c/example.c,$(wildcard codec/c/*.c)) -lm \
+		-o out/fuzz/encode/fuzz
+	out/fuzz/encode/fuzz -max_total_time=60 -max_len=3000 -artifact_prefix=out/fuzz/encode/ out/fuzz/encode/corpus
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \
