@@ -100,8 +100,9 @@ bench: $(VENV)/.dev native ## measure what is missing in out/bench, suite by sui
 		$(BENCH) run $$suite || exit 1; \
 	done
 
-wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
+wasm: ## compile decoder and encoder in C for JavaScript; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
 	codec/js/wasm/build.sh codec/js/wasm_binary.mjs
+	codec/js-encoder/wasm/build.sh codec/js-encoder/wasm_binary.mjs
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python conformance/lab/fuzz.py --target all --seconds 2400

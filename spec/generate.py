@@ -41,6 +41,7 @@ VERSIONED = ROOT / "codec" / "csplat" / "__init__.py"
 VERSION_LINES = {
     ROOT / "CITATION.cff": r"(?m)^(version: )\S+()$",
     ROOT / "codec" / "c" / "CMakeLists.txt": r"(?m)^(project\(csplat VERSION )\S+( )",
+    ROOT / "codec" / "js-encoder" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
     ROOT / "codec" / "js" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
 }
 

@@ -1588,6 +1588,20 @@ static int lattice_exponent(double largest, double step)
     return ratio < integer_most ? 0 : ceil_log2(ratio / integer_most) + 1;
 }
 
+/* The lattice of a tile's colours. */
+typedef struct grid {
+    double step, inverse;
+    int exponent;   /* included in the step */
+    int coarseness; /* of an exponent of 0: integers are multiples of 2 to this */
+} grid;
+
+static grid grid_of(double step, int exponent, int coarseness)
+{
+    grid g = {ldexp(step, exponent), 0.0, exponent, coarseness};
+    g.inverse = 1.0 / g.step;
+    return g;
+}
+
 /* Round a colour, in steps, to Y, Co, Cg, multiples of 2^coarse. The second function is for a coarser lattice. */
 static void round_colour(const float rgb[3], int coarseness, int32_t out[3])
 {
@@ -1624,15 +1638,15 @@ static void round_wide_colour(const double rgb[3], int32_t out[3])
 }
 
 /* Quantise a colour to Y, Co, Cg, and decode it (spec 7.1, 7.2). */
-static void quantise_colour(const float rgb[3], double step, int exponent, int coarseness, int32_t out[3], float decoded[3])
+static inline void quantise_colour(const float rgb[3], const grid *g, int32_t out[3], float decoded[3])
 {
     int32_t lifted[3], co, cg, t;
-    if (exponent == 0) {
-        const float inverse = (float)(1.0 / step);
+    if (g->exponent == 0) {
+        const float inverse = (float)g->inverse;
         float scaled[3] = {rgb[0] * inverse, rgb[1] * inverse, rgb[2] * inverse};
-        round_colour(scaled, coarseness, out);
+        round_colour(scaled, g->coarseness, out);
     } else {
-        const double inverse = 1.0 / step;
+        const double inverse = g->inverse;
         double scaled[3] = {rgb[0] * inverse, rgb[1] * inverse, rgb[2] * inverse};
         round_wide_colour(scaled, out);
     }
@@ -1643,7 +1657,7 @@ static void quantise_colour(const float rgb[3], double step, int exponent, int c
     lifted[2] = t - (co >> 1);
     lifted[0] = lifted[2] + co;
     for (int c = 0; c < 3; c++)
-        decoded[c] = (float)(lifted[c] * step);
+        decoded[c] = (float)(lifted[c] * g->step);
 }
 
 typedef struct quaternion {
@@ -1799,7 +1813,7 @@ enum { POINTS = 4 };
 #if defined __wasm_simd128__
 typedef v128_t vector;
 #define LOAD(p) wasm_v128_load(p)
-#define STORE(p, v) wasm_v128_store(p, v)
+#define STORE(p, a) wasm_v128_store(p, a)
 #define FILL(x) wasm_i32x4_splat(x)
 #define ADD_PRODUCTS(sum, a, b) wasm_i32x4_add(sum, wasm_i32x4_dot_i16x8(a, b))
 #define ABOVE(a, b) wasm_i32x4_gt(a, b)
@@ -1807,7 +1821,7 @@ typedef v128_t vector;
 #elif defined __SSE2__
 typedef __m128i vector;
 #define LOAD(p) _mm_loadu_si128((const __m128i *)(p))
-#define STORE(p, v) _mm_storeu_si128((__m128i *)(p), v)
+#define STORE(p, a) _mm_storeu_si128((__m128i *)(p), a)
 #define FILL(x) _mm_set1_epi32(x)
 #define ADD_PRODUCTS(sum, a, b) _mm_add_epi32(sum, _mm_madd_epi16(a, b))
 #define ABOVE(a, b) _mm_cmpgt_epi32(a, b)
@@ -1822,7 +1836,7 @@ static vector LOAD(const void *p)
     memcpy(&result, p, sizeof result);
     return result;
 }
-#define STORE(p, v) memcpy(p, (v).v, sizeof(vector))
+#define STORE(p, a) memcpy(p, (a).v, sizeof(vector))
 static vector FILL(int32_t x)
 {
     vector result = {{x, x, x, x}};
@@ -2412,13 +2426,13 @@ static int put_codebook(encoder *e, unsigned band)
 }
 
 /* Quantise SH of some rows without a codebook; integers are `columns`, [3][K][n]. */
-static int quantise_sh(encoder *e, const uint32_t *rows, uint32_t n, double step, int exponent, int coarseness, float *decoded)
+static int quantise_sh(encoder *e, const uint32_t *rows, uint32_t n, grid g)
 {
     for (uint32_t i = 0; i < n; i++)
         for (unsigned k = 0; k < e->coefficients; k++) {
             int32_t out[3];
-            float *value = decoded + 3 * ((size_t)i * e->coefficients + k);
-            quantise_colour(sh_of(e, rows[i]) + 3 * k, step, exponent, coarseness, out, value);
+            float *value = e->s.decoded + 3 * ((size_t)i * e->coefficients + k);
+            quantise_colour(sh_of(e, rows[i]) + 3 * k, &g, out, value);
             for (size_t c = 0; c < 3; c++)
                 e->s.columns[(c * e->coefficients + k) * n + i] = out[c];
             if (isinf(value[0]) || isinf(value[1]) || isinf(value[2]))
@@ -2444,7 +2458,7 @@ static int try_scalar(encoder *e, const uint32_t *rows, uint32_t n, double step,
 {
     size_t start = e->store.size;
     double *errors = e->s.squares, *weights = errors + n;
-    TRY(quantise_sh(e, rows, n, step, 0, 0, e->s.decoded));
+    TRY(quantise_sh(e, rows, n, grid_of(step, 0, 0)));
     for (uint32_t i = 0; i < n; i++) {
         const float *sh = sh_of(e, rows[i]);
         double squares[VALUES_MAX];
@@ -2534,6 +2548,7 @@ static int finish_codebook(encoder *e)
 {
     codebook *b = &e->book;
     const float step = (float)e->p.codebook_sh;
+    const grid unit = grid_of(1.0, 0, 0);
     TRY(b->scaled = get(e, (uint64_t)b->size * e->values, sizeof *b->scaled));
     TRY(b->decoded = get(e, (uint64_t)b->size * e->values, sizeof *b->decoded));
     TRY(b->columns = get(e, (uint64_t)b->size * e->values, sizeof *b->columns));
@@ -2542,7 +2557,7 @@ static int finish_codebook(encoder *e)
             const int32_t *entry = b->entries + k * e->values + 3 * m;
             float rgb[3] = {(float)entry[0], (float)entry[1], (float)entry[2]}, decoded[3];
             int32_t out[3];
-            quantise_colour(rgb, 1.0, 0, 0, out, decoded);
+            quantise_colour(rgb, &unit, out, decoded);
             for (unsigned c = 0; c < 3; c++) {
                 b->scaled[k * e->values + 3 * m + c] = rgb[c] * step;
                 b->decoded[k * e->values + 3 * m + c] = (float)(decoded[c] * e->p.codebook_sh);
@@ -2754,20 +2769,18 @@ static int put_means(encoder *e, const part *t, double step)
 static int put_sh0(encoder *e, uint32_t n)
 {
     float most = 0.0f;
-    double largest = 0.0, step;
-    int exponent;
+    double largest = 0.0;
     for (uint32_t i = 0; i < n; i++)
         for (unsigned k = 0; k < 3; k++) {
             float value = fabsf(e->in->sh0[3 * (size_t)e->s.rows[i] + k]);
             most = value > most ? value : most;
         }
-    exponent = lattice_exponent(2.0 * most, e->p.sh0);
-    step = ldexp(e->p.sh0, exponent);
+    const grid g = grid_of(e->p.sh0, lattice_exponent(2.0 * most, e->p.sh0), 0);
     for (uint32_t i = 0; i < n; i++) {
         const float *source = e->in->sh0 + 3 * (size_t)e->s.rows[i];
         float decoded[3];
         int32_t out[3];
-        quantise_colour(source, step, exponent, 0, out, decoded);
+        quantise_colour(source, &g, out, decoded);
         for (unsigned k = 0; k < 3; k++) {
             double error = (double)decoded[k] - (double)source[k];
             e->s.columns[k * (size_t)n + i] = out[k];
@@ -2778,7 +2791,7 @@ static int put_sh0(encoder *e, uint32_t n)
     if (!(largest <= FLT_MAX))
         return fail(e, CSPLAT_E_INPUT, "E_INPUT: sh0 are too large to quantise: values at the limit of float32");
     add_squares(e, SH0, largest, 3 * (size_t)n, 1 << 16);
-    return put_offset_block(e, SPEC_ATTRIBUTE_SH0, e->s.columns, n, exponent);
+    return put_offset_block(e, SPEC_ATTRIBUTE_SH0, e->s.columns, n, g.exponent);
 }
 
 /* Add the errors of the SH bands of a tile, whose values are decoded. */
@@ -2829,7 +2842,7 @@ static int put_scalar_sh(encoder *e, part *t)
             most = value > most ? value : most;
         }
     exponent = lattice_exponent(2.0 * most, e->p.sh);
-    TRY(quantise_sh(e, e->s.rows, t->count, ldexp(e->p.sh, exponent), exponent, 0, e->s.decoded));
+    TRY(quantise_sh(e, e->s.rows, t->count, grid_of(e->p.sh, exponent, 0)));
     add_sh_errors(e, t->count);
     for (unsigned band = 1; band <= e->degree; band++)
         if (gather_band(e, band, t->count)) {
@@ -2861,7 +2874,7 @@ static int put_sh_by_codebook(encoder *e, part *t)
     for (uint32_t i = 0; i < n; i++)
         if (e->s.index[i] == b->size)
             rows[escaped++] = e->s.rows[i];
-    TRY(quantise_sh(e, rows, escaped, e->p.sh, 0, CODEBOOK_FINER, e->s.decoded));
+    TRY(quantise_sh(e, rows, escaped, grid_of(e->p.sh, 0, CODEBOOK_FINER)));
     for (uint32_t i = n, from = escaped; i-- > 0;) /* from the last, because escapes are at the front */
         memmove(e->s.decoded + (size_t)i * e->values,
                 e->s.index[i] == b->size ? e->s.decoded + (size_t)--from * e->values : b->decoded + e->s.index[i] * e->values,

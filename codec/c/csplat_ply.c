@@ -342,7 +342,7 @@ static int check_rows(reader *r, uint64_t count)
 {
     uint64_t size = least_row(r), left = (uint64_t)(r->end - r->at) + (r->form == TEXT);
     if (size ? count > left / size : count > UINT32_MAX)
-        return fail(r, CSPLAT_E_INPUT, "E_INPUT: the file is cut off: it has no room for %lu rows", (unsigned long)count);
+        return fail(r, CSPLAT_E_INPUT, "E_INPUT: the file is cut off: it has no room for its rows");
     return 1;
 }
 

@@ -2,16 +2,13 @@
 """The encoder in C: it writes the integers of the preset `fast`, passes the encoder suite, and refuses bad input."""
 
 import ctypes
-import shutil
-import subprocess
 import zlib
 from dataclasses import replace
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
-from chromium import absent
+from c_encoder import BUCKET_SPLATS, SAMPLE, C, compiled, run
 
 import csplat
 from csplat.decoder.decode_api import decode_integers, decode_scene
@@ -19,24 +16,8 @@ from csplat.scene_metadata import SceneMetadata
 from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).resolve().parents[2]
-C = ROOT / "codec" / "c"
-SOURCES = [C / name for name in ("csplat_encode.c", "csplat_ply.c", "deflate.c")]
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{C}")
 SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-COMPILER = shutil.which("cc")
-SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
-BUCKET_SPLATS = csplat.EncodeOptions().bucket_splats
 in_depth = pytest.mark.long
-
-
-def compiled(folder, name, *arguments):
-    if COMPILER is None:
-        absent("there is no C compiler, cc")
-    command = [COMPILER, *STRICT, *arguments, *SOURCES, "-lm", "-o", folder / name]
-    made = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
-    assert (0, "") == (made.returncode, made.stderr)
-    return folder / name
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +29,6 @@ def library(tmp_path_factory):
 @pytest.fixture(scope="module", params=[("-O2",), pytest.param(SANITIZED, marks=in_depth)], ids=["plain", "sanitizers"])
 def tool(request, tmp_path_factory):
     return compiled(tmp_path_factory.mktemp("tool"), "encode", *request.param, C / "tools" / "encode.c")
-
-
-def run(tool, *arguments, folder):
-    """Return the status and both outputs of the tool."""
-    ended = subprocess.run([tool, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    return ended.returncode, ended.stdout, ended.stderr
 
 
 Allocate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
