@@ -4,7 +4,8 @@
 #
 #     codec/js-encoder/wasm/build.sh codec/js-encoder/wasm_binary.mjs
 #
-# Loops that matter have SIMD by intrinsics. Vectorisation is off, because clang 14's, of straight-line code, changes results.
+# Loops that matter have SIMD by intrinsics. The compiler's own vectorisation is off: clang 14's makes wrong logarithms of two
+# numbers at once (split_logarithm).
 # The output is reproducible with the packages of Debian 12: clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32.
 set -eu
 cd "$(dirname "$0")"
