@@ -7,10 +7,11 @@
 
 #include <string.h>
 
-enum { LITERALS = 286, DISTANCES = 30, LENGTHS = 19, END = 256, BITS_MAX = 15, LENGTH_BITS_MAX = 7 };
+enum { LITERALS = 286, FIXED_LITERALS = 288, DISTANCES = 30, LENGTHS = 19, END = 256, BITS_MAX = 15, LENGTH_BITS_MAX = 7 };
 enum { MATCH_MIN = 4, MATCH_MAX = 258, WINDOW = 1 << 15, HASH_BITS = 14, CHAIN_MAX = 6 };
 enum { CHUNK = 8192, BLOCK = 1 << 16 }; /* symbols after which a block may end, and has to end */
 enum { HEADER_BITS = 480 };             /* typical size of the codes of a block */
+enum { FIXED_SYMBOLS_MAX = 1024 };      /* symbols of a block from which codes of its own are shorter */
 enum { SAMPLE = 4096, SAMPLES = 4 };
 
 typedef enum method { CHAINS, RUNS, NO_MATCHES, METHODS } method;
@@ -20,8 +21,8 @@ typedef struct frequencies {
 } frequencies;
 
 typedef struct code {
-    uint16_t words[LITERALS]; /* first bit lowest */
-    uint8_t bits[LITERALS];
+    uint16_t words[FIXED_LITERALS]; /* first bit lowest */
+    uint8_t bits[FIXED_LITERALS];
 } code;
 
 typedef struct deflater {
@@ -253,16 +254,9 @@ static void put_codes(deflater *d)
     }
 }
 
-/* Write the symbols of `block`, and move those of `chunk` to its place. */
-static void put_block(deflater *d, int is_last)
+/* Write the symbols of `block` and its end by the present codes. */
+static void put_symbols(deflater *d)
 {
-    d->block.literals[END] = 1;
-    choose_lengths(d->block.literals, LITERALS, BITS_MAX, d->literals.bits);
-    choose_lengths(d->block.distances, DISTANCES, BITS_MAX, d->distances.bits);
-    assign_words(d->literals.bits, LITERALS, d->literals.words);
-    assign_words(d->distances.bits, DISTANCES, d->distances.words);
-    put_bits(d, (uint32_t)is_last | 2 << 1, 3);
-    put_codes(d);
     for (uint32_t i = 0; i < d->block_count; i++) {
         uint32_t symbol = d->symbols[i];
         if (symbol < 256) {
@@ -278,6 +272,49 @@ static void put_block(deflater *d, int is_last)
         put_bits(d, (distance - 1) & ((UINT32_C(1) << extra) - 1), extra);
     }
     put_bits(d, d->literals.words[END], d->literals.bits[END]);
+}
+
+/* Write `block` with codes of its own. */
+static void put_dynamic_block(deflater *d, uint32_t is_last)
+{
+    choose_lengths(d->block.literals, LITERALS, BITS_MAX, d->literals.bits);
+    choose_lengths(d->block.distances, DISTANCES, BITS_MAX, d->distances.bits);
+    assign_words(d->literals.bits, LITERALS, d->literals.words);
+    assign_words(d->distances.bits, DISTANCES, d->distances.words);
+    put_bits(d, is_last | 2 << 1, 3);
+    put_codes(d);
+    put_symbols(d);
+}
+
+/* Write `block` with the codes of RFC 1951, 3.2.6, which are shorter than the description of others if there are few symbols. */
+static void put_fixed_block(deflater *d, uint32_t is_last)
+{
+    for (unsigned i = 0; i < FIXED_LITERALS; i++)
+        d->literals.bits[i] = i < 144 ? 8 : i < 256 ? 9 : i < 280 ? 7 : 8;
+    memset(d->distances.bits, 5, DISTANCES);
+    assign_words(d->literals.bits, FIXED_LITERALS, d->literals.words);
+    assign_words(d->distances.bits, DISTANCES, d->distances.words);
+    put_bits(d, is_last | 1 << 1, 3);
+    put_symbols(d);
+}
+
+/* Write the symbols of `block` in the shorter way, and move those of `chunk` to its place. */
+static void put_block(deflater *d, uint32_t is_last)
+{
+    const uint64_t bits = d->bits;
+    const size_t size = d->size;
+    const unsigned bit_count = d->bit_count;
+    d->block.literals[END] = 1;
+    put_dynamic_block(d, is_last);
+    if (d->block_count < FIXED_SYMBOLS_MAX) {
+        uint64_t dynamic = 8 * (uint64_t)d->size + d->bit_count;
+        d->bits = bits, d->size = size, d->bit_count = bit_count;
+        put_fixed_block(d, is_last);
+        if (dynamic < 8 * (uint64_t)d->size + d->bit_count) {
+            d->bits = bits, d->size = size, d->bit_count = bit_count;
+            put_dynamic_block(d, is_last);
+        }
+    }
     d->symbol_count -= d->block_count;
     memmove(d->symbols, d->symbols + d->block_count, d->symbol_count * sizeof *d->symbols);
     d->block = d->chunk;
