@@ -100,8 +100,9 @@ bench: $(VENV)/.dev native ## measure what is missing in out/bench, suite by sui
 		$(BENCH) run $$suite || exit 1; \
 	done
 
-wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
+wasm: ## compile decoder and encoder in C for JavaScript; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
 	codec/js/wasm/build.sh codec/js/wasm_binary.mjs
+	codec/js-encoder/wasm/build.sh codec/js-encoder/wasm_binary.mjs
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python conformance/lab/fuzz.py --target all --seconds 2400
@@ -115,6 +116,10 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 	$(CLANG) $(FUZZED) codec/c/fuzz/inflate.c -lz -o out/fuzz/inflate/fuzz
 	out/fuzz/inflate/fuzz -max_total_time=120 -max_len=2000 -artifact_prefix=out/fuzz/inflate/
 	$(BIN)/python conformance/lab/fuzz.py --target others --replay out/fuzz/c/corpus
+	@mkdir -p out/fuzz/encode/corpus
+	$(CLANG) $(FUZZED) -DCSPLAT_NO_ZLIB codec/c/fuzz/encode.c $(filter-out codec/c/example.c,$(wildcard codec/c/*.c)) -lm \
+		-o out/fuzz/encode/fuzz
+	out/fuzz/encode/fuzz -max_total_time=60 -max_len=3000 -artifact_prefix=out/fuzz/encode/ out/fuzz/encode/corpus
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \

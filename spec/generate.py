@@ -33,6 +33,7 @@ TYPES = ROOT / "codec" / "js" / "decoder.d.ts"
 WGSL = ROOT / "codec" / "wgsl"
 SHADERS = ROOT / "tools" / "viewer" / "wgsl.mjs"
 C = ROOT / "codec" / "c" / "csplat.c"
+C_ENCODER = ROOT / "codec" / "c" / "csplat_encode.c"
 C_HEADER = ROOT / "codec" / "c" / "csplat.h"
 
 #: The module with csplat's version, and the lines of other files that repeat it.
@@ -40,6 +41,7 @@ VERSIONED = ROOT / "codec" / "csplat" / "__init__.py"
 VERSION_LINES = {
     ROOT / "CITATION.cff": r"(?m)^(version: )\S+()$",
     ROOT / "codec" / "c" / "CMakeLists.txt": r"(?m)^(project\(csplat VERSION )\S+( )",
+    ROOT / "codec" / "js-encoder" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
     ROOT / "codec" / "js" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
 }
 
@@ -82,7 +84,8 @@ def main() -> int:
         RULES: rules_module(registry),
         JAVASCRIPT: javascript_module(registry),
         TYPES: with_types(TYPES.read_text(encoding="utf-8"), registry),
-        C: with_c_numbers(C.read_text(encoding="utf-8"), registry),
+        C: with_c_error_names(with_c_numbers(C.read_text(encoding="utf-8"), registry), registry),
+        C_ENCODER: with_c_numbers(C_ENCODER.read_text(encoding="utf-8"), registry),
         C_HEADER: with_c_codes(C_HEADER.read_text(encoding="utf-8"), registry),
         **with_tables({path: path.read_text(encoding="utf-8") for path in DOCUMENTS}, registry),
         SHADERS: shader_module(sorted(WGSL.glob("*.wgsl"))),
@@ -491,7 +494,7 @@ def between(text: str, begin: str, new: str, end: str) -> str:
 
 
 def with_c_numbers(text: str, registry: Registry) -> str:
-    """Return the text of codec/c/csplat.c with updated numbers of the format."""
+    """Return the text of a C source with updated numbers of the format."""
     form = registry["format"]
     magic = "".join(f"\\{byte:03o}" for byte in form["magic"])
     lines = [
@@ -517,7 +520,11 @@ def with_c_numbers(text: str, registry: Registry) -> str:
         size = struct.calcsize("<" + "".join(struct_code(field) for field in fields))
         places = zip(fields, field_offsets(fields), strict=True)
         lines += [f"#define {prefix}_SIZE {size}", *(f"#define {prefix}_AT_{f[0].upper()} {at}" for f, at in places)]
-    text = between(text, "/* begin generated: numbers */\n", "\n".join(lines) + "\n", "/* end generated */")
+    return between(text, "/* begin generated: numbers */\n", "\n".join(lines) + "\n", "/* end generated */")
+
+
+def with_c_error_names(text: str, registry: Registry) -> str:
+    """Return the text of codec/c/csplat.c with updated names of error codes."""
     names = [f'{" " * 40}"{e["id"]}",\n' for e in enum_named(registry, "error")["entries"]]
     return between(
         text, "/* begin generated: names of error codes */\n", "".join(names), f"{' ' * 40}/* end generated */"
