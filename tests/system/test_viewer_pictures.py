@@ -367,7 +367,7 @@ def test_files_may_be_in_memory(engine, part_file, camera):
         script = f"(text) => {{ const bytes = {bytes_}; return open_({kind}); }}"
         assert engine.page.evaluate(script, base64.b64encode(part_file).decode()) is None
         stats = engine.stats()
-        assert len(part_file) == stats["received"] > stats["firstPictureBytes"] > 0.5 * len(part_file)
+        assert len(part_file) >= stats["received"] > stats["firstPictureBytes"] > 0.5 * len(part_file)
         assert (engine.picture(camera) == wanted).all()
 
 
