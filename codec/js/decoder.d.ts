@@ -26,7 +26,7 @@ export type Form = 'floats' | 'integers';
 /** The form of a reader's tiles and layers. */
 export type LayerForm = Form | 'packed';
 
-export interface DecodeOptions {
+export interface DecodeOptions extends FetchOptions {
   limits?: Limits;
   /** SH bands above this degree are not decoded (their chunks are still checked). */
   shDegree?: number;
@@ -34,8 +34,9 @@ export interface DecodeOptions {
   tiles?: Iterable<number>;
   /** 'integers' returns the arrays of the spec, section 9.2. */
   form?: Form;
+  /** Ends the decoding, and the requests for its bytes. */
   signal?: AbortSignal;
-  /** Called with the number of splats decoded so far, and of all splats. */
+  /** Called with the number of splats decoded so far, as their bytes arrive, and of all splats. */
   onProgress?: (done: number, total: number) => void;
   /**
    * Maximum number of workers, each of which decodes a tile at a time. Default: 0, which decodes in this thread. If a
@@ -325,17 +326,18 @@ export type IntegerScene = IntegerSplats & Whole;
  * Decode a whole file and check all of its checksums. The result is level 0, or the tiles in the options; integers are by
  * default those of all levels.
  */
-export function decode(
-  data: ArrayBuffer | ArrayBufferView,
-  options: DecodeOptions & { form: 'integers' },
-): Promise<IntegerScene>;
-export function decode(
-  data: ArrayBuffer | ArrayBufferView,
-  options?: DecodeOptions & { form?: 'floats' },
-): Promise<Scene>;
+export function decode(data: FileSource, options: DecodeOptions & { form: 'integers' }): Promise<IntegerScene>;
+export function decode(data: FileSource, options?: DecodeOptions & { form?: 'floats' }): Promise<Scene>;
 
 /** Read and check header and index; the data may end after the index. */
 export function readHeader(data: ArrayBuffer | ArrayBufferView, options?: { limits?: Limits }): Header;
+
+/**
+ * A file: its address, in Node, Bun and Deno also its path or file: URL; a Blob; a Response or a stream of bytes, which are
+ * read once, as they arrive; its bytes; or an object that reads it.
+ */
+export type FileSource =
+  string | URL | Blob | Response | ReadableStream<Uint8Array> | ArrayBuffer | ArrayBufferView | ByteSource;
 
 /** The source of a reader's bytes. `read` returns exactly `size` bytes or throws. */
 export interface ByteSource {
@@ -417,11 +419,8 @@ export interface LayerRequest {
 
 /** Reads tiles and layers of a file in any order; checks the CRC of each part. */
 export class CsplatReader {
-  /** Open a URL, or data. In Node, pass a file on disk as `await fs.openAsBlob(path)`. */
-  static open(
-    from: string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource,
-    options?: ReaderOptions,
-  ): Promise<CsplatReader>;
+  /** Open a file with one request for header and index. */
+  static open(from: FileSource, options?: ReaderOptions): Promise<CsplatReader>;
   readonly header: Header;
   readonly checks: Checks;
   /** Retries of a request, as in the options; may be changed. */

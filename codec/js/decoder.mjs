@@ -2,7 +2,7 @@
 // Decoder of the csplat format, from spec/format.md. No dependencies. Runs in browsers, workers and Node 20.
 //
 //   import { CsplatReader, decode, readHeader } from './decoder.mjs';
-//   const scene = await decode(bytes);              // the whole scene as Float32Arrays
+//   const scene = await decode(url);                // the whole scene as Float32Arrays; also of bytes, a Response, a stream
 //   const reader = await CsplatReader.open(url);    // header and index, then only the parts that are read
 //   const tile = await reader.readTile(0, { shDegree: 1 });
 //   const tiles = await reader.cut({ maxSplats: 1e6 }); // of a coarser version of the scene, if the file has one
@@ -16,7 +16,6 @@ import { Reader } from './reader.mjs';
 import * as spec from './spec.mjs';
 import { allTiles } from './tile_records.mjs';
 import { selectTiles } from './tree.mjs';
-import { MemorySource } from './whole_sources.mjs';
 import { byWorkers } from './workers.mjs';
 
 export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
@@ -56,15 +55,14 @@ export function readHeader(data, options = {}) {
 /**
  * Decode a whole file and check all of its checksums. decoder.d.ts describes the options and the result.
  *
- * @param {ArrayBuffer | ArrayBufferView} data
+ * @param {import('./decoder.d.ts').FileSource} data
  * @param {DecodeOptions} [options]
  * @returns {Promise<any>} Scene, or IntegerScene for the form 'integers'
  */
 export async function decode(data, options = {}) {
-  const { limits, inflate, signal, onProgress } = options;
-  const source = new MemorySource(toBytes(data));
+  const { inflate, signal, onProgress } = options;
   const integers = checkedForm(options.form);
-  const reader = await Reader.open(source, { limits, inflate });
+  const reader = await Reader.open(data, { ...options, onProgress: undefined }, true);
   const { header } = reader;
   // 9.2: the integer arrays have "all tiles of all levels concatenated".
   const tiles = integers && options.tiles === undefined ? allTiles(header) : checkedTiles(options.tiles, header);
@@ -104,6 +102,7 @@ export async function decode(data, options = {}) {
     return { ...assembly.fields(), header, ...(await reader.describe()), checks, workers: workers.size };
   } finally {
     reader.compiled?.close();
+    reader.source.close?.();
   }
 }
 

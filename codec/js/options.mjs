@@ -24,19 +24,7 @@ export function toBytes(data) {
     // Another thread could change shared memory between a check and its use.
     return bytes.buffer instanceof ArrayBuffer ? /** @type {Uint8Array<ArrayBuffer>} */ (bytes) : bytes.slice();
   }
-  throw new InputError(`the data is neither an ArrayBuffer nor a view of one${remedyFor(data)}`);
-}
-
-/**
- * @param {unknown} data
- * @returns {string} starts with a colon; '' if it is nothing that users often pass
- */
-function remedyFor(data) {
-  if (typeof data === 'string' || data instanceof URL) return ': CsplatReader.open takes addresses';
-  const name = typeof data === 'object' && data !== null ? data.constructor?.name : '';
-  if (name === 'Response' || name === 'Blob' || name === 'File')
-    return `: pass \`await ${name.toLowerCase()}.arrayBuffer()\``;
-  return name === 'ReadableStream' ? ': pass `await new Response(stream).arrayBuffer()`' : '';
+  throw new InputError('the data is neither an ArrayBuffer nor a view of one');
 }
 
 /**

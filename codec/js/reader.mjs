@@ -85,15 +85,17 @@ export class Reader {
   /**
    * Open a file, with one request for header and index unless the index is very large.
    *
-   * @param {string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource} from
+   * @param {import('./decoder.d.ts').FileSource} from
    * @param {ReaderOptions} [options]
+   * @param {boolean} [isWhole] whether all of the file will be read
    * @returns {Promise<Reader>} of the class that `open` is called on
    */
-  static async open(from, options = {}) {
+  static async open(from, options = {}, isWhole = false) {
     const limits = checkedLimits(options.limits);
     const progress = { received: 0, fileSize: 0 };
     const way = wayOf(options, {
       firstBytes: Math.max(spec.HEADER_SIZE, options.firstBytes ?? FIRST_BYTES),
+      isWhole,
       limit: limits.bytes,
       received: (size) => options.onProgress?.((progress.received += size), progress.fileSize),
     });
@@ -209,7 +211,9 @@ export class Reader {
    */
   async whole(work, signal) {
     try {
-      return await abortable(work, signal);
+      let reading = work;
+      for (const one of [...(this.way?.signals ?? []), signal]) reading = abortable(reading, one ?? undefined);
+      return await reading;
     } catch (error) {
       throw await explained(error, this.source, this.opening);
     }

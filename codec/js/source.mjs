@@ -6,7 +6,7 @@ import { InputError } from './errors.mjs';
 import { toBytes } from './options.mjs';
 import { HEADER_SIZE } from './spec.mjs';
 import { Transport, onAbort, unlessAborted } from './transport.mjs';
-import { BlobSource, CallerSource, MemorySource, WholeSource, cutShort, shortData } from './whole_sources.mjs';
+import { CallerSource, LocalSource, WholeSource, cutShort, openFile, shortData } from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
@@ -17,29 +17,59 @@ const TINY_ANSWERS = 16; // in a row after which the server is asked for the who
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
  * @typedef {import('./decoder.d.ts').ByteRange} ByteRange
+ * @typedef {import('./decoder.d.ts').FileSource} FileSource
  * @typedef {import('./transport.mjs').Way} Way
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  */
 
 /**
- * @param {string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource} from
+ * @param {FileSource} from
  * @param {Way} way request options
  * @returns {Promise<ByteSource>}
  */
 export async function openSource(from, way) {
-  if (typeof from === 'string' || from instanceof URL) return openUrl(absolute(from, way), way);
-  if (from instanceof Blob) return new BlobSource(from);
-  if (from instanceof ArrayBuffer || ArrayBuffer.isView(from)) return new MemorySource(toBytes(from));
-  if (typeof from?.read === 'function') return new CallerSource(from);
-  throw new InputError(
-    'the source is not a URL, a Blob, an ArrayBuffer, a view of one or an object with a method read',
-  );
+  if (typeof from === 'string' || from instanceof URL) {
+    return isOnDisk(from, way) ? openFile(from, way) : openUrl(absolute(from, way), way);
+  }
+  if (from instanceof Blob) return new LocalSource('the Blob', from.size, partsOf(from), way);
+  if (from instanceof ArrayBuffer || ArrayBuffer.isView(from)) {
+    const bytes = toBytes(from);
+    return new LocalSource('the data', bytes.length, async (start, end) => bytes.subarray(start, end), way);
+  }
+  const given = /** @type {any} */ (from);
+  if (typeof given?.getReader === 'function' || (given?.headers && 'body' in given)) return openBody(given, way);
+  if (typeof given?.pipe === 'function') {
+    throw new InputError('the source is a stream of Node: pass `Readable.toWeb(stream)`');
+  }
+  if (typeof given?.read === 'function') return new CallerSource(given);
+  const kinds = 'an address, a Blob, a Response, a ReadableStream, an ArrayBuffer, a view of one';
+  throw new InputError(`the source is not ${kinds} or an object with a method read`);
 }
 
-const { process, Deno, Bun } = /** @type {any} */ (globalThis);
-const IS_NODE = process?.versions?.node !== undefined && !Deno && !Bun;
-const DISK = /^(file|[a-z]):/i; // with a drive of Windows
-const FROM_DISK = 'for a file on disk pass `await fs.openAsBlob(path)`, of node:fs';
+/**
+ * Return a function that reads parts of a Blob.
+ *
+ * @param {Blob} blob
+ * @returns {(start: number, end: number) => Promise<Bytes>}
+ */
+const partsOf = (blob) => async (start, end) => new Uint8Array(await blob.slice(start, end).arrayBuffer());
+
+/**
+ * Tell whether an address is a path or a file: URL for Node and its like, which cannot fetch them all.
+ *
+ * @param {string | URL} address
+ * @param {Way} way
+ */
+function isOnDisk(address, { hasFetch }) {
+  const { process, document, location } = /** @type {any} */ (globalThis);
+  const isPage = document !== undefined || location !== undefined; // also in Electron
+  return (
+    !hasFetch &&
+    !isPage &&
+    process?.versions?.node !== undefined &&
+    /^(?:file:|(?![a-z][a-z\d+.-]+:))/i.test(String(address))
+  );
+}
 
 /**
  * @param {string | URL} url
@@ -48,13 +78,43 @@ const FROM_DISK = 'for a file on disk pass `await fs.openAsBlob(path)`, of node:
 function absolute(url, { hasFetch }) {
   const { document, location } = /** @type {any} */ (globalThis);
   try {
-    const { href } = new URL(url, document?.baseURI ?? location?.href);
-    if (hasFetch || !IS_NODE || !DISK.test(href)) return href;
+    return new URL(url, document?.baseURI ?? location?.href).href;
   } catch {
     if (hasFetch) return String(url); // which may understand it
-    if (!IS_NODE) throw new InputError(`“${url}” is not a URL`);
+    throw new InputError(`“${url}” is not a URL`);
   }
-  throw new InputError(`“${url}” is not a URL that can be fetched: ${FROM_DISK}`);
+}
+
+/**
+ * Read an answer of the caller, or a stream, as it arrives.
+ *
+ * @param {Response | ReadableStream<Uint8Array>} from
+ * @param {Way} way
+ */
+async function openBody(from, way) {
+  const isStream = 'getReader' in from;
+  const name = isStream ? 'the stream' : from.url || 'the response';
+  if (isStream ? from.locked : from.bodyUsed || from.body?.locked) {
+    throw new InputError(`${name}: its bytes are read elsewhere`);
+  }
+  const response = isStream ? new Response(from) : from;
+  const once = { fetch: async () => response, isOnce: true, retries: 0, timeoutMs: Infinity, renew: undefined };
+  const source = new HttpSource(new Transport(name, { ...way, ...once, isWhole: true }));
+  return begun(source, way);
+}
+
+/**
+ * @param {HttpSource} source
+ * @param {Way} way
+ */
+async function begun(source, way) {
+  try {
+    await source.begin(way.firstBytes);
+    return source;
+  } catch (error) {
+    source.close();
+    throw error;
+  }
 }
 
 /**
@@ -65,14 +125,14 @@ function absolute(url, { hasFetch }) {
  * @param {Way} way
  */
 async function openUrl(url, way) {
-  if (/^(blob|data):/.test(url)) return new BlobSource(await fetchBlob(url, way));
+  if (/^(blob|data):/.test(url)) {
+    const blob = await fetchBlob(url, way);
+    return new LocalSource(url, blob.size, partsOf(blob), { ...way, received: () => {} });
+  }
   const isLocal = url.startsWith('file:');
-  const source = new HttpSource(new Transport(url, isLocal ? { ...way, retries: 0 } : way));
   try {
-    await source.begin(way.firstBytes);
-    return source;
+    return await begun(new HttpSource(new Transport(url, isLocal ? { ...way, retries: 0 } : way)), way);
   } catch (error) {
-    source.close();
     if (!isLocal || !(error instanceof InputError)) throw error;
     const detail =
       'a page opened from disk cannot load files. `csplat export-html` puts viewer and scene into one page';
@@ -251,7 +311,7 @@ export class HttpSource {
           const taken = part.subarray(0, until - start - filled);
           if (filled + taken.length > bytes.length) bytes = longer(bytes, filled + taken.length, end - start);
           bytes.set(taken, filled);
-          transport.count(start + filled, start + filled + taken.length);
+          transport.arrivals.count(start + filled, start + filled + taken.length);
           filled += taken.length;
           if (start + filled >= until) break;
         }

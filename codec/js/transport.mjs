@@ -3,6 +3,7 @@
 
 import { differ, isCoded, judge } from './answers.mjs';
 import { CsplatError, InputError } from './errors.mjs';
+import { toBytes } from './options.mjs';
 
 const RETRIES = 4; // in a row; with the waits below, 7.5 s until the error
 const RETRY_MS = 500; // until the first retry; doubled each time
@@ -24,6 +25,8 @@ const PROGRESS_BYTES = 1024; // bytes between two failures after which they are 
  * @typedef {object} Way
  * @property {typeof fetch} fetch
  * @property {boolean} hasFetch whether it is the caller's
+ * @property {boolean} isWhole whether the whole file will be read: it is requested without Range
+ * @property {boolean} [isOnce] whether `fetch` has one answer, which ends where the file does
  * @property {RequestInit} init
  * @property {(AbortSignal | null | undefined)[]} signals each ends everything
  * @property {number} firstBytes
@@ -39,7 +42,7 @@ const PROGRESS_BYTES = 1024; // bytes between two failures after which they are 
 
 /**
  * @param {ReaderOptions} options
- * @param {Pick<Way, 'firstBytes' | 'limit' | 'received'>} sizes
+ * @param {Pick<Way, 'firstBytes' | 'isWhole' | 'limit' | 'received'>} sizes
  * @returns {Way}
  */
 export function wayOf(options, sizes) {
@@ -222,7 +225,7 @@ class Body {
       while (reader) {
         const { value, done } = await attempt.during(reader.read());
         if (done) break;
-        yield value;
+        yield toBytes(value); // a caller's stream may have other parts
       }
     } finally {
       reader?.cancel().catch(() => {});
@@ -243,6 +246,33 @@ class Body {
 
 /** @param {string | null} text */
 const numberOf = (text) => (text === null ? null : Number(text));
+
+/** Counts bytes that have arrived, each once. */
+export class Arrivals {
+  /** @param {Way['received']} received */
+  constructor(received) {
+    this.received = received;
+    /** @type {[number, number][]} */
+    this.ranges = [];
+  }
+
+  /**
+   * @param {number} start
+   * @param {number} end
+   */
+  count(start, end) {
+    let fresh = end - start;
+    let [low, high] = [start, end];
+    this.ranges = this.ranges.filter(([from, to]) => {
+      if (to < start || from > end) return true;
+      fresh -= Math.max(0, Math.min(to, end) - Math.max(from, start));
+      [low, high] = [Math.min(low, from), Math.max(high, to)];
+      return false;
+    });
+    this.ranges.push([low, high]);
+    if (fresh > 0) this.received(fresh);
+  }
+}
 
 /** A file at an address. */
 export class Transport {
@@ -269,9 +299,8 @@ export class Transport {
     this.isChanged = false;
     /** Whether the server has answered with parts, and whether it is not asked for them any more. */
     this.hasParts = false;
-    this.isPlain = false;
-    /** Ranges that have arrived. @type {[number, number][]} */
-    this.arrived = [];
+    this.isPlain = way.isWhole;
+    this.arrivals = new Arrivals(way.received);
   }
 
   /** Size of the file; null if unknown. */
@@ -285,25 +314,6 @@ export class Transport {
 
   close() {
     this.closing.abort();
-  }
-
-  /**
-   * Count bytes that have arrived, each once.
-   *
-   * @param {number} start
-   * @param {number} end
-   */
-  count(start, end) {
-    let fresh = end - start;
-    let [low, high] = [start, end];
-    this.arrived = this.arrived.filter(([from, to]) => {
-      if (to < start || from > end) return true;
-      fresh -= Math.max(0, Math.min(to, end) - Math.max(from, start));
-      [low, high] = [Math.min(low, from), Math.max(high, to)];
-      return false;
-    });
-    this.arrived.push([low, high]);
-    if (fresh > 0) this.way.received(fresh);
   }
 
   /**

@@ -3,8 +3,9 @@
 // again by the JavaScript modules, which report the error and its offset.
 
 import { shRows } from './arrays.mjs';
+import { platformInflate } from './inflate.mjs';
 import * as spec from './spec.mjs';
-import { WASM } from './wasm_binary.mjs';
+import { WASM, WASM_BYTES } from './wasm_binary.mjs';
 
 /**
  * @typedef {import('./arrays.mjs').FloatArrays} FloatArrays
@@ -48,9 +49,10 @@ function compiledModule() {
   compiling ??= (async () => {
     try {
       const text = atob(WASM);
-      const bytes = new Uint8Array(text.length);
-      for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i); // Uint8Array.from is several times slower
-      const module = await WebAssembly.compile(bytes);
+      const coded = new Uint8Array(text.length);
+      for (let i = 0; i < text.length; i++) coded[i] = text.charCodeAt(i); // Uint8Array.from is several times slower
+      const inflate = await platformInflate();
+      const module = await WebAssembly.compile(new Uint8Array(await inflate(coded, WASM_BYTES)));
       spare = new WeakRef(new WasmDecoder(module)); // WebKit applies the policy only when the module is instantiated
       return module;
     } catch {

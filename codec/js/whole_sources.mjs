@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sources that hold the whole file: a body from a server without ranges, memory, a Blob.
+// Sources that have the whole file: a body from a server without ranges, memory, a Blob, a file on disk.
 
 import { replaced } from './answers.mjs';
 import { readFileHeader } from './container.mjs';
 import { InputError, LimitError, allocate, fault } from './errors.mjs';
 import { toBytes } from './options.mjs';
 import { ERROR_LIMIT, ERROR_TRAILING, ERROR_TRUNCATED, HEADER_SIZE, MAGIC } from './spec.mjs';
-import { abortable, asInputError } from './transport.mjs';
+import { Arrivals, abortable, asInputError, unlessAborted } from './transport.mjs';
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
@@ -14,6 +14,7 @@ import { abortable, asInputError } from './transport.mjs';
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  * @typedef {import('./answers.mjs').Asked} Asked
  * @typedef {import('./transport.mjs').Transport} Transport
+ * @typedef {import('./transport.mjs').Way} Way
  * @typedef {import('./transport.mjs').Answer} Sent
  */
 
@@ -81,7 +82,7 @@ export class WholeSource {
     const end = offset + size;
     if (this.failure) {
       const { error } = this.failure;
-      if (!(error instanceof InputError && error.isTransient)) throw error;
+      if (!(error instanceof InputError && error.isTransient) || this.transport.way.isOnce) throw error;
       this.begin(null, null); // the caller tries again
     }
     if (!this.isOpen) await this.#arrival(HEADER_SIZE, signal);
@@ -141,7 +142,7 @@ export class WholeSource {
       at += part.length;
     }
     if (this.isOpen && this.filled === this.bytes.length) return true;
-    const isComplete = body.size === at - start;
+    const isComplete = body.size === at - start || this.transport.way.isOnce === true;
     if (take === 'part' && isComplete && at > start) return false; // fewer bytes than requested
     if (this.isOpen && asked && take === 'whole' && at === asked.end - asked.start) throw this.#partAsWhole(asked);
     const size = this.isOpen ? this.bytes.length : HEADER_SIZE;
@@ -171,7 +172,7 @@ export class WholeSource {
       }
       const taken = part.subarray(from, from + this.bytes.length - this.filled);
       this.bytes.set(taken, this.filled);
-      this.transport.count(this.filled, this.filled + taken.length);
+      this.transport.arrivals.count(this.filled, this.filled + taken.length);
       this.filled += taken.length;
       from += taken.length;
       if (!this.isOpen) this.#open(asked);
@@ -212,25 +213,6 @@ export class WholeSource {
     return new InputError(`${this.transport.url}: ${detail}, which announces the whole file; a part needs status 206`, {
       ...{ reason: 'server', status: 200 },
     });
-  }
-}
-
-/** Bytes in memory. */
-export class MemorySource {
-  /** @param {Bytes} bytes */
-  constructor(bytes) {
-    this.bytes = bytes;
-    this.size = bytes.length;
-  }
-
-  /**
-   * @param {number} offset
-   * @param {number} size
-   * @returns {Promise<Bytes>}
-   */
-  async read(offset, size) {
-    if (offset + size > this.size) throw shortData(this.size, size);
-    return this.bytes.subarray(offset, offset + size);
   }
 }
 
@@ -284,21 +266,89 @@ export class CallerSource {
   }
 }
 
-/** A File or Blob, such as a file dropped on a page. */
-export class BlobSource {
-  /** @param {Blob} blob */
-  constructor(blob) {
-    this.blob = blob;
-    this.size = blob.size;
+/** Bytes in memory, a Blob, such as a file dropped on a page, or a file on disk. */
+export class LocalSource {
+  /**
+   * @param {string} name for messages
+   * @param {number} size
+   * @param {(start: number, end: number) => Promise<Bytes>} load
+   * @param {Way} way
+   */
+  constructor(name, size, load, way) {
+    this.name = name;
+    this.size = size;
+    this.load = load;
+    this.way = way;
+    this.arrivals = new Arrivals(way.received);
   }
 
   /**
    * @param {number} offset
    * @param {number} size
+   * @param {AbortSignal} [signal]
    * @returns {Promise<Bytes>}
    */
-  async read(offset, size) {
-    if (offset + size > this.blob.size) throw shortData(this.blob.size, size);
-    return new Uint8Array(await this.blob.slice(offset, offset + size).arrayBuffer());
+  async read(offset, size, signal) {
+    const end = offset + size;
+    if (end > this.size) throw shortData(this.size, size);
+    const bytes = await unlessAborted([...this.way.signals, signal], () =>
+      this.load(offset, end).catch((error) => {
+        throw unreadable(this.name, error);
+      }),
+    );
+    if (bytes.length < size) throw shortData(offset + bytes.length, size); // it was shortened
+    this.arrivals.count(offset, end);
+    return bytes;
+  }
+}
+
+/**
+ * @param {string} name
+ * @param {any} error
+ */
+const unreadable = (name, error) =>
+  new InputError(`${name} cannot be read: ${error?.message ?? error}`, { cause: error });
+
+/**
+ * Open a file on disk, in Node and its like.
+ *
+ * @param {string | URL} from a path or a file: URL
+ * @param {Way} way
+ * @returns {Promise<LocalSource>}
+ */
+export async function openFile(from, way) {
+  const name = 'node:fs/promises'; // hides it from bundlers for browsers
+  try {
+    const { open, stat } = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
+    const path = String(from).startsWith('file:') ? new URL(from) : from;
+    const { size } = await stat(path);
+    return new LocalSource(`“${from}”`, size, (start, end) => readFile(open, path, start, end), way);
+  } catch (error) {
+    throw unreadable(`“${from}”`, error);
+  }
+}
+
+/**
+ * Read a part of a file, which is open meanwhile.
+ *
+ * @param {(path: string | URL) => Promise<any>} open of node:fs/promises
+ * @param {string | URL} path
+ * @param {number} start
+ * @param {number} end
+ * @returns {Promise<Bytes>} fewer bytes if the file ends before
+ */
+async function readFile(open, path, start, end) {
+  const file = await open(path);
+  try {
+    const bytes = allocate(() => new Uint8Array(end - start));
+    let filled = 0;
+    while (filled < bytes.length) {
+      const { bytesRead } = await file.read(bytes, filled, bytes.length - filled, start + filled);
+      if (bytesRead === 0) break;
+      filled += bytesRead;
+    }
+    return bytes.subarray(0, filled);
+  } finally {
+    await file.close();
   }
 }

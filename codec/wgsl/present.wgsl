@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Shows blended pixels before a background, as a triangle that covers the target.
+// Shows blended pixels before a background, which may be transparent, as a triangle that covers the target. Colours are
+// premultiplied by alpha.
 
 struct Backdrop { colour: vec4<f32>, width: u32, first_row: u32, unused0: u32, unused1: u32 }
 
@@ -13,7 +14,8 @@ fn cover(@builtin(vertex_index) corner: u32) -> @builtin(position) vec4<f32> {
 }
 
 fn before_backdrop(colour: vec3<f32>, transmittance: f32) -> vec4<f32> {
-  return vec4<f32>(clamp(colour + transmittance * backdrop.colour.rgb, vec3<f32>(0.0), vec3<f32>(1.0)), 1.0);
+  let sum = vec4<f32>(colour, 1.0 - transmittance) + transmittance * backdrop.colour;
+  return vec4<f32>(clamp(sum.rgb, vec3<f32>(0.0), vec3<f32>(sum.a)), sum.a);
 }
 
 @fragment

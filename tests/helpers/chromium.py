@@ -211,7 +211,7 @@ class EnginePage(_ServedPage):
         return self._read("engine.readPixels()", camera)
 
     def picture_of_now(self, camera):
-        return self._read("(engine.drawNow(), engine.renderer.readPixels())", camera)
+        return self._read("engine.renderer.pixelsOf(engine.view, engine.look)", camera)
 
     def _read(self, pixels, camera):
         return read_pixels(self.page, pixels, camera.W, camera.H)[..., :3] / 255.0

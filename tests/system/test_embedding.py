@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The unchanged samples of codec/EMBEDDING.md, and `<csplat-view>` in other pages."""
 
+import base64
 import gzip
 import json
 import re
@@ -18,6 +19,7 @@ from command_line import call, invoke
 from csplat import EncodeOptions, decode, encode
 from csplat.ply import read_ply
 from csplat.spherical_harmonics import evaluate_sh
+from csplat_render.camera_files import load_cameras
 from csplat_tools.present.viewer_page import export_element
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -445,3 +447,216 @@ def test_the_script_is_written_once(tmp_path):
     assert "--force replaces it" in call("export-element", out, status=1).stderr
     wrong = invoke("export-element", "scene.csplat")
     assert "did you mean `csplat export-element scene.js`" in wrong.stderr
+
+
+# CSS of an element, that of its container, and the expected size in a window of 390 × 844; a window of 1280 × 844.
+SIZES = {
+    "": (390, 260, 1280, 853), "height: 70vh": (390, 591, 1280, 591), "height: 100px": (390, 100, 1280, 100),
+    "width: 50%": (195, 130, 640, 427), "width: 300px; height: 100px": (300, 100, 300, 100),
+    "aspect-ratio: 2": (390, 195, 1280, 640), "max-height: 100px": (390, 100, 1280, 100),
+    "min-height: 900px": (390, 900, 1280, 900), "margin: 20px": (350, 233, 1240, 827),
+    "position: absolute; inset: 0": (390, 844, 1280, 844), "position: absolute": (300, 200, 300, 200),
+    "display: inline-block": (300, 200, 300, 200), "display: inline-block; height: 90px": (300, 90, 300, 90),
+}  # fmt: skip
+
+
+def test_css_gives_the_size_that_it_says(tab, blog):
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    page = blog("<main><csplat-view></csplat-view></main>", policy="")
+    page.evaluate("document.head.querySelector('[rel=stylesheet]').remove(), document.body.style.margin = 0")
+    found = {}
+    for css in SIZES:
+        found[css] = ()
+        for width in (390, 1280):
+            page.set_viewport_size({"width": width, "height": 844})
+            found[css] += tuple(
+                page.evaluate(
+                    """(css) => {
+                      const view = document.querySelector('csplat-view');
+                      view.style.cssText = css;
+                      const canvas = view.shadowRoot.querySelector('canvas');
+                      if (canvas.clientHeight !== view.offsetHeight) throw new Error('the canvas does not fill it');
+                      return [view.offsetWidth, view.offsetHeight];
+                    }""",
+                    css,
+                )
+            )
+    assert SIZES == found
+
+
+# Makes `image`, with pixels that are not premultiplied, of a Blob or a promise of it.
+IMAGE = """async (made) => {
+  const blob = await made;
+  const bitmap = await createImageBitmap(blob);
+  const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext('2d', { willReadFrequently: true });
+  context.drawImage(bitmap, 0, 0);
+  globalThis.image = context.getImageData(0, 0, bitmap.width, bitmap.height);
+  return [image.width, image.height, blob.type];
+}"""
+
+
+def image_of(page, blob):
+    """Return an image and its type, [H, W, 4] uint8, of an expression for its Blob or a promise of it."""
+    width, height, kind = page.evaluate(f"({IMAGE})({blob})")
+    return read_pixels(page, "image.data", width, height), kind
+
+
+def test_a_page_shows_through_a_transparent_scene_and_images_of_it(tab, blog):
+    scene = '<csplat-view src="/scene.csplat" background="transparent" backend="{}"></csplat-view>'
+    for backend in ("webgl2", "webgpu-tiles", "webgpu-quads"):
+        page = blog(scene.format(backend), policy="")
+        assert_loads(tab, 60)
+        page.evaluate(
+            "globalThis.view = document.querySelector('csplat-view'), document.body.style.background = '#0f0'"
+        )
+        pixels = read_pixels(page, "view.engine.readPixels()", 160, 120).astype(int)
+        assert (pixels[..., :3] <= pixels[..., 3:]).all()  # premultiplied
+        assert pixels[0, 0, 3] == 0
+        assert (pixels[..., 3] > 200).any()
+        png = base64.b64encode(page.screenshot(clip={"x": 9, "y": 9, "width": 1, "height": 1})).decode()
+        shot, _ = image_of(page, f"fetch('data:image/png;base64,{png}').then((answer) => answer.blob())")
+        assert [0, 255, 0, 255] == shot[0, 0].tolist()
+        image, kind = image_of(page, "view.toBlob()")
+        assert ("image/png", (120, 160, 4)) == (kind, image.shape)
+        alpha = image[..., 3:].astype(int)
+        assert np.abs(alpha - pixels[..., 3:]).max() <= 1
+        solid = image[..., :3] * (alpha / 255.0)
+        assert np.abs(solid - pixels[..., :3]).max() <= 2
+        # A soft edge has the colour of the splat, not that of black behind it.
+        soft = (alpha[..., 0] > 40) & (alpha[..., 0] < 120)
+        assert image[soft][:, :3].max(axis=1).mean() > 0.7 * image[alpha[..., 0] > 200][:, :3].max(axis=1).mean()
+        page.evaluate("view.background = 'ff0000'")
+        assert [255, 0, 0, 255] == page.evaluate("view.engine.readPixels().then((pixels) => [...pixels.slice(0, 4)])")
+
+
+def test_images_have_any_size_and_camera_and_the_canvas_stays_as_it_is(tab, site, blog):
+    page = blog('<csplat-view src="/scene.csplat"></csplat-view>', policy="")
+    assert_loads(tab, 60)
+    page.evaluate("globalThis.view = document.querySelector('csplat-view')")
+    (sample,) = (text for text in samples("js") if text.startswith("// poster.mjs"))
+    site.add("/blog/poster.mjs", sample.encode())
+    with page.expect_download() as saved:
+        page.evaluate("import('/blog/poster.mjs').then(({ savePoster }) => savePoster(view))")
+    assert b"WEBP" == Path(saved.value.path()).read_bytes()[8:12]
+    before = read_pixels(page, "view.engine.readPixels()", 160, 120)
+    large, kind = image_of(page, "view.toBlob({ width: 480, type: 'image/webp', quality: 1 })")
+    assert ("image/webp", (360, 480, 4)) == (kind, large.shape)
+    small = large.reshape(120, 3, 160, 3, 4).mean(axis=(1, 3))
+    assert np.abs(small - before).mean() < 3
+    page.evaluate("view.engine.setSize(40, 30)")  # as on a slow machine
+    np.testing.assert_array_equal(before, image_of(page, "view.toBlob()")[0])
+    page.evaluate("view.engine.setSize(160, 120)")
+    camera = "{ ...view.camera, viewmat: [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 9], [0, 0, 0, 1]] }"
+    other, _ = image_of(page, f"view.toBlob({{ camera: {camera} }})")
+    assert (other != before).any()
+    np.testing.assert_array_equal(before, read_pixels(page, "view.engine.readPixels()", 160, 120))
+    refusals = {
+        "{ width: 0 }": "E_INPUT", "{ height: 1.5 }": "E_INPUT", "{ width: NaN }": "E_INPUT",
+        "{ camera: {} }": "E_INPUT", "{ type: 'image/none' }": "E_INPUT",
+        "{ width: 1e6, height: 1 }": "E_LIMIT", "{ width: 65536, height: 65536 }": "E_LIMIT",
+    }  # fmt: skip
+    code = "(given) => view.toBlob(given).then(() => 'made', ({ name, code }) => name === 'EngineError' && code)"
+    found = {given: page.evaluate(f"({code})({given})") for given in refusals}
+    assert refusals == found
+    late = "const made = view.toBlob().catch(({ code }) => code); view.src = '/other.csplat'; return made;"
+    assert "E_REPLACED" == page.evaluate(f"(() => {{ {late} }})()")
+    assert_loads(tab, 90)
+    assert "E_INPUT" == page.evaluate("document.createElement('csplat-view').toBlob().catch(({ code }) => code)")
+
+
+POSTER = (
+    "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' width='3' height='2'>"
+    "<rect width='3' height='2' fill='red'/></svg>"
+)
+
+
+def test_a_poster_is_shown_until_there_is_a_picture_and_if_there_is_none(tab, site, blog):
+    page = blog("<csplat-view alt='A garden'></csplat-view>")
+    page.evaluate(
+        """{ globalThis.view = document.querySelector('csplat-view');
+        const isHidden = () => view.shadowRoot.querySelector('#poster').hidden;
+        view.addEventListener('firstpicture', ({ detail }) => told.push(['', 'firstpicture', isHidden(), detail])); }"""
+    )
+    size = page.evaluate("[view.offsetWidth, view.offsetHeight]")
+    page.evaluate("(poster) => { view.poster = poster; }", POSTER)
+    poster = page.locator("csplat-view #poster")
+    assert poster.is_visible()
+    assert size == page.evaluate("[view.offsetWidth, view.offsetHeight]")
+    page.evaluate("view.src = '/scene.csplat'")
+    kind, is_hidden, detail = told(tab)
+    assert ("firstpicture", True, True) == (kind, is_hidden, detail["firstPictureMs"] > 0)
+    assert poster.is_hidden()
+    assert_loads(tab, 60)
+    site.add("/broken.csplat", b"no scene")
+    page.evaluate("view.src = '/broken.csplat'")
+    assert "E_MAGIC" == told(tab)[1]["code"]
+    assert poster.is_visible()
+    assert "A garden" == poster.get_attribute("alt")
+    assert page.locator("csplat-view canvas").is_hidden()
+    page.evaluate("view.poster = '/none.svg'")
+    poster.wait_for(state="hidden")
+    tab.problems.clear()  # the browser reports the status
+
+
+def test_the_camera_can_be_kept_restored_and_followed(tab, blog, tmp_path):
+    page = blog('<csplat-view src="/scene.csplat"></csplat-view>', policy="")
+    assert_loads(tab, 60)
+    page.evaluate(
+        """{ globalThis.view = document.querySelector('csplat-view'); globalThis.moves = []; globalThis.times = [];
+        view.addEventListener('camerachange', ({ detail }) => (moves.push(detail), times.push(performance.now()))); }"""
+    )
+    kept = page.evaluate("view.camera")
+    (tmp_path / "cameras.json").write_text(json.dumps([kept]))
+    (camera,) = load_cameras(tmp_path / "cameras.json")
+    assert (160, 120) == (camera.W, camera.H)
+    np.testing.assert_array_equal(camera.viewmat, kept["viewmat"])
+    page.mouse.move(80, 60)
+    page.mouse.down()
+    page.mouse.move(110, 70, steps=6)
+    page.mouse.up()
+    tab.until("moves.length > 0 && JSON.stringify(moves.at(-1)) === JSON.stringify(view.camera)")
+    assert kept["viewmat"] != page.evaluate("view.camera.viewmat")
+    assert page.evaluate("times.every((time, i) => i === 0 || time - times[i - 1] > 90)")
+    page.evaluate("(camera) => { moves.length = 0; view.camera = camera; }", kept)
+    tab.until(f"JSON.stringify(view.camera) === '{json.dumps(kept, separators=(',', ':'))}'")
+    page.wait_for_timeout(150)
+    assert [] == page.evaluate("moves")  # of the user's movements alone
+    with page.expect_console_message(lambda message: "The camera cannot be used" in message.text):
+        page.evaluate("view.camera = { K: 1 }")
+    assert kept == page.evaluate("view.camera")
+
+
+def test_controls_can_be_limited_and_turned_off(tab, blog):
+    page = blog('<csplat-view src="/scene.csplat" alt="A garden" controls="none"></csplat-view>', policy="")
+    assert_loads(tab, 60)
+    page.evaluate("globalThis.view = document.querySelector('csplat-view')")
+    canvas = page.locator("csplat-view canvas")
+    before = page.evaluate("view.camera")
+    page.mouse.move(80, 60)
+    page.mouse.down()
+    page.mouse.move(120, 80, steps=3)
+    page.mouse.up()
+    page.keyboard.press("Tab")
+    page.keyboard.press("ArrowUp", delay=100)
+    assert before == page.evaluate("view.camera")
+    assert ["img", "A garden", None] == [canvas.get_attribute(name) for name in ("role", "aria-label", "tabindex")]
+
+    page.evaluate("view.controls = 'orbit min-distance=2 max-distance=4 max-polar=90'")
+    assert canvas.get_attribute("aria-label").startswith("A garden. Arrow keys turn it")
+    page.emulate_media(reduced_motion="reduce")
+    page.keyboard.press("Tab")
+    assert "2px" == page.eval_on_selector("csplat-view canvas", "(one) => getComputedStyle(one).outlineWidth")
+    distances = []
+    for key in ("Minus", "Equal"):
+        page.keyboard.down(key)
+        page.wait_for_timeout(1500)
+        page.keyboard.up(key)
+        page.wait_for_timeout(100)
+        distances.append(page.evaluate("Math.hypot(...view.camera.viewmat.slice(0, 3).map((row) => row[3]))"))
+    assert abs(distances[0] - distances[1] - 2) < 0.01 * 2 + 1  # the pivot is near the origin, not in it
+    page.keyboard.down("ArrowUp")
+    page.wait_for_timeout(1500)
+    page.keyboard.up("ArrowUp")
+    page.wait_for_timeout(100)
+    forward = page.evaluate("view.camera.viewmat[2]")
+    assert forward[1] >= -1e-6  # y is down: the camera is not below the pivot

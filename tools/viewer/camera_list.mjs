@@ -81,6 +81,7 @@ export class CameraList {
     this.facts = noFacts();
     /** @type {Bounds | null} */
     this.bounds = null;
+    this.splatCount = 0;
     this.shown = 0;
     this.up = directionOf(DEFAULT_AXES, 'U');
     /** Whether the camera still waits to be placed. */
@@ -111,13 +112,15 @@ export class CameraList {
   /**
    * Use the cameras in the address.
    *
-   * @param {unknown[]} entries cameras of a camera file
+   * @param {unknown[] | null} entries cameras of a camera file; null for those of the scene
    * @param {number} first index of the initial camera
    */
   useCameras(entries, first) {
-    this.wantedCameras = entries.map(named);
-    if (first >= entries.length) throw new RangeError(`number ${first} of ${entries.length}, counted from 0`);
-    this.first = first;
+    const cameras = (entries ?? []).map(named);
+    if (entries && first >= cameras.length)
+      throw new RangeError(`number ${first} of ${cameras.length}, counted from 0`);
+    this.wantedCameras = cameras;
+    this.first = entries ? first : 0;
   }
 
   /**
@@ -175,12 +178,21 @@ export class CameraList {
   place(bounds, splatCount, atOnce) {
     if (!this.waits || bounds === this.bounds) return false;
     this.bounds = bounds;
+    this.splatCount = splatCount;
     this.waits = bounds.coarse;
     const pose = this.#firstPose(bounds, splatCount);
     this.rig.home = pose;
     if (this.controls.touched) return false;
     this.controls.glide(pose, atOnce || pose.viewmat !== undefined);
     return true;
+  }
+
+  /** Show the initial view at once, if the scene has been placed. */
+  showFirst() {
+    if (!this.bounds) return;
+    this.shown = this.first;
+    this.rig.home = this.#firstPose(this.bounds, this.splatCount);
+    this.controls.glide(this.rig.home, true);
   }
 
   /** Return to the initial view. */
@@ -260,7 +272,7 @@ export class CameraList {
     const front = frontFor(axes || DEFAULT_AXES, up);
     const { pose, frame } = automaticPose(bounds, splatCount, { up, front, isFrontKnown: axes !== '' });
     this.rig.extent = frame.extent;
-    return pose;
+    return this.rig.limited(pose);
   }
 }
 

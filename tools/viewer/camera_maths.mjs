@@ -41,6 +41,41 @@ export function viewOf({ viewmat, fx, fy, cx, cy, near = DEFAULT_NEAR }, width, 
 }
 
 /**
+ * Convert a camera to another size of its picture, which shows all that the first one does.
+ *
+ * @template {{fx: number, fy: number, cx: number, cy: number}} T
+ * @param {T} camera
+ * @param {{width: number, height: number}} from pixels
+ * @param {{width: number, height: number}} to
+ * @returns {T}
+ */
+export function fitCamera(camera, from, to) {
+  const k = fitScale(from, to);
+  const cx = camera.cx * k + (to.width - from.width * k) / 2;
+  const cy = camera.cy * k + (to.height - from.height * k) / 2;
+  return { ...camera, fx: camera.fx * k, fy: camera.fy * k, cx, cy };
+}
+
+/**
+ * Complete the size of a picture.
+ *
+ * @param {{width?: number, height?: number}} wanted pixels
+ * @param {{width: number, height: number}} usual pixels; its shape is kept if one side is given
+ */
+export function completeSize({ width, height }, usual) {
+  const across = width ?? Math.max(1, Math.round(((height ?? usual.height) * usual.width) / usual.height));
+  return { width: across, height: height ?? Math.max(1, Math.round((across * usual.height) / usual.width)) };
+}
+
+/**
+ * Return the scale at which a whole picture fits another size.
+ *
+ * @param {{width: number, height: number}} from
+ * @param {{width: number, height: number}} to
+ */
+export const fitScale = (from, to) => Math.min(to.width / from.width, to.height / from.height);
+
+/**
  * Return the smallest and largest x/z and y/z at which the perspective is linearised.
  *
  * @param {View} view

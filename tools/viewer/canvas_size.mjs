@@ -42,12 +42,23 @@ export class CanvasSize {
     this.fit();
   }
 
-  /** Set the drawing buffer to its current target size. */
-  fit() {
+  /** Size of the drawing buffer at full resolution, pixels. */
+  get full() {
+    return this.#sizeAt(1);
+  }
+
+  /** @param {number} quality share of the full resolution */
+  #sizeAt(quality) {
     const { canvas, fixed } = this;
-    const ratio = Math.min(devicePixelRatio || 1, PIXEL_RATIO) * (this.moving ? this.quality : 1);
+    const ratio = Math.min(devicePixelRatio || 1, PIXEL_RATIO) * quality;
     const width = fixed?.width ?? Math.max(1, Math.round(canvas.clientWidth * ratio));
     const height = fixed?.height ?? Math.max(1, Math.round(canvas.clientHeight * ratio));
+    return { width, height };
+  }
+
+  /** Set the drawing buffer to its current target size. */
+  fit() {
+    const { width, height } = this.#sizeAt(this.moving ? this.quality : 1);
     if (width === this.width && height === this.height) return;
     this.width = width;
     this.height = height;

@@ -120,7 +120,7 @@ export class Controls {
     }
     canvas.addEventListener('wheel', (event) => this.#wheel(event), { signal, passive: false });
     canvas.addEventListener('dblclick', ({ offsetX, offsetY }) => this.#choosePivot(offsetX, offsetY), { signal });
-    canvas.addEventListener('contextmenu', (event) => event.preventDefault(), { signal });
+    canvas.addEventListener('contextmenu', (event) => this.#isOff || event.preventDefault(), { signal });
     reach.keys.addEventListener('keydown', (event) => this.#key(/** @type {KeyboardEvent} */ (event)), { signal });
     reach.keys.addEventListener('blur', () => this.keys.clear(), { signal });
     const released = (/** @type {KeyboardEvent} */ { code, shiftKey }) => {
@@ -130,14 +130,25 @@ export class Controls {
     addEventListener('keyup', released, { signal });
   }
 
+  /** Whether users may only orbit the pivot. */
+  get #isBound() {
+    return this.rig.limits.kind === 'orbit';
+  }
+
+  get #isOff() {
+    return this.rig.limits.kind === 'none';
+  }
+
   /** @param {PointerEvent} event */
   #down(event) {
+    if (this.#isOff) return;
     const { offsetX: x, offsetY: y, button, shiftKey, ctrlKey, metaKey } = event;
     this.canvas.focus({ preventScroll: true });
     this.canvas.setPointerCapture(event.pointerId);
     if (this.pointers.size === 0) this.before = { pose: this.rig.pose, touched: this.touched };
     this.pointers.set(event.pointerId, { x, y });
-    this.press = { x, y, still: this.pointers.size === 1, pans: button !== 0 || shiftKey || ctrlKey || metaKey };
+    const pans = !this.#isBound && (button !== 0 || shiftKey || ctrlKey || metaKey);
+    this.press = { x, y, still: this.pointers.size === 1, pans };
     this.gliding = null;
   }
 
@@ -154,8 +165,8 @@ export class Controls {
       const centre = { x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 };
       const apart = Math.hypot(now.x - other.x, now.y - other.y);
       const wasApart = Math.hypot(before.x - other.x, before.y - other.y);
-      this.rig.pan((now.x - before.x) / 2, (now.y - before.y) / 2, width, height);
-      if (apart > 1 && wasApart > 1) this.rig.zoom(wasApart / apart, { ...centre, width, height });
+      if (!this.#isBound) this.rig.pan((now.x - before.x) / 2, (now.y - before.y) / 2, width, height);
+      if (apart > 1 && wasApart > 1) this.#zoom(wasApart / apart, centre);
       this.#changed();
     } else if (this.press.pans) {
       this.rig.pan(now.x - before.x, now.y - before.y, width, height);
@@ -187,14 +198,22 @@ export class Controls {
 
   /** @param {WheelEvent} event */
   #wheel(event) {
-    if (!this.reach.wheel()) return;
+    if (this.#isOff || !this.reach.wheel()) return;
     event.preventDefault();
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    const pixels = event.deltaY * (event.deltaMode === 1 ? LINE : event.deltaMode === 2 ? height : 1);
+    const pixels = event.deltaY * (event.deltaMode === 1 ? LINE : event.deltaMode === 2 ? this.canvas.clientHeight : 1);
     const step = Math.min(0.7, Math.max(-0.7, pixels * (event.ctrlKey ? PINCH_WHEEL : WHEEL)));
     this.gliding = null;
-    this.rig.zoom(Math.exp(step), { x: event.offsetX, y: event.offsetY, width, height });
+    this.#zoom(Math.exp(step), { x: event.offsetX, y: event.offsetY });
     this.#changed();
+  }
+
+  /**
+   * @param {number} factor
+   * @param {{x: number, y: number}} at pointer on the canvas
+   */
+  #zoom(factor, at) {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    this.rig.zoom(factor, this.#isBound ? undefined : { ...at, width, height });
   }
 
   /**
@@ -202,7 +221,7 @@ export class Controls {
    * @param {number} y
    */
   #choosePivot(x, y) {
-    const pose = this.hooks.pivotAt(x, y);
+    const pose = this.rig.limits.kind === 'free' && this.hooks.pivotAt(x, y);
     if (!pose) return;
     this.touched = true;
     this.glide(pose);
@@ -213,7 +232,8 @@ export class Controls {
     const { code, target, ctrlKey, metaKey, altKey, shiftKey } = event;
     this.shift = shiftKey;
     const elsewhere = target instanceof Element && target.closest('input, select, textarea, dialog');
-    if (ctrlKey || metaKey || altKey || elsewhere || !(code in FLY || code in ZOOM)) return;
+    const isKnown = code in ZOOM || code in (this.#isBound ? TURN : FLY);
+    if (ctrlKey || metaKey || altKey || elsewhere || this.#isOff || !isKnown) return;
     event.preventDefault();
     this.keys.add(code);
     this.gliding = null;
@@ -288,7 +308,7 @@ export class Controls {
     for (const code of this.keys) {
       this.touched = true;
       if (code in ZOOM) rig.zoom(Math.exp(ZOOM[code] * KEY_ZOOM * seconds));
-      else if (shift && code in TURN) rig.orbit(...scaled(TURN[code], KEY_TURN * seconds));
+      else if ((shift || this.#isBound) && code in TURN) rig.orbit(...scaled(TURN[code], KEY_TURN * seconds));
       else rig.fly(scaled(FLY[code], rig.speed * seconds * (shift ? FASTER : 1)));
     }
     return this.keys.size > 0;

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // <csplat-view src="scene.csplat" alt="A garden">: a scene in a page, used like an image and sized by CSS.
 //
-// Attributes: src, alt, crossorigin, and these parameters of main.mjs: camera, view, up, axes, background, backend; all of them
-// are properties, too. Properties alone: fetch, request, renew, retries, timeoutMs, as of the engine.
-// Events: progress, load (detail: the engine's Stats), error (detail: ErrorReport). Property `engine`: null until it loads.
+// Attributes: src, alt, poster, crossorigin, and these parameters of main.mjs: camera, view, up, axes, background, controls,
+// backend; all of them are properties, too. Properties alone: fetch, request, renew, retries, timeoutMs, as of the engine.
+// Events: progress, firstpicture and load (detail: the engine's Stats), camerachange (detail: FileCamera), error (detail:
+// ErrorReport). Property `engine`: null until it loads. Method: toBlob.
 
 import { heldBlob } from './engine.mjs';
-import { E_CONTEXT } from './engine_error.mjs';
+import { E_CONTEXT, E_INPUT, EngineError } from './engine_error.mjs';
 import { explain } from './messages.mjs';
 import { nameOf, readWishes } from './page.mjs';
 import { loadedShare } from './statistics.mjs';
@@ -17,23 +18,34 @@ import { SceneViewer } from './viewer.mjs';
  * @typedef {import('./types.d.ts').Progress} Progress
  */
 
-const WISHES = ['camera', 'view', 'up', 'axes', 'background', 'backend'];
-const REFLECTED = ['src', 'alt', ...WISHES]; // properties of the same name
+const WISHES = ['camera', 'view', 'up', 'axes', 'background', 'controls', 'backend'];
+const REFLECTED = ['src', 'alt', 'poster', ...WISHES]; // properties of the same name
 const FETCHING = /** @type {const} */ (['fetch', 'request', 'renew', 'retries', 'timeoutMs']);
-const HOW =
-  'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.';
+const HOW = {
+  free: 'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.',
+  orbit: 'Arrow keys turn it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.',
+  none: '',
+};
 const AHEAD = '50% 0px'; // distance from the window at which an element starts to load
+const CAMERA_MS = 100; // time between two events of a moving camera
+// The box gives the element its usual size: a CSS height replaces the shape, not the width.
 const SHEET = `
-:host { display: block; position: relative; aspect-ratio: 3 / 2; overflow: hidden; background: #000; }
+:host { display: block; position: relative; overflow: hidden; background: #000; }
+:host([background='transparent' i]) { background: none; }
 :host([hidden]) { display: none; }
 [hidden] { display: none !important; }
-canvas { position: absolute; inset: 0; width: 100%; height: 100%; cursor: grab; outline: none; user-select: none; -webkit-user-select: none; touch-action: pan-y; }
-canvas:active { cursor: grabbing; }
-canvas.active { touch-action: none; }
+#box { aspect-ratio: 3 / 2; contain: inline-size; contain-intrinsic-inline-size: 300px; }
+canvas, #poster { position: absolute; inset: 0; width: 100%; height: 100%; user-select: none; -webkit-user-select: none; }
+#poster { object-fit: contain; pointer-events: none; }
+canvas { outline: none; }
+canvas[tabindex] { cursor: grab; touch-action: pan-y; }
+canvas[tabindex]:active { cursor: grabbing; }
+canvas[tabindex].active { touch-action: none; }
 canvas.keys { outline: 2px solid #1f8fe0; outline-offset: -2px; }
 #progress { position: absolute; inset: 0 0 auto; height: 3px; background: rgb(128 128 128 / 0.4); }
 #bar { height: 100%; background: #7cc7ff; transform: scaleX(0); transform-origin: 0 0; }
 #error { position: absolute; inset: 0; margin: auto; box-sizing: border-box; width: min(440px, calc(100% - 24px)); height: fit-content; max-height: calc(100% - 24px); overflow: auto; padding: 16px 18px; border-radius: 12px; background: Canvas; color: CanvasText; font: 14px/1.45 system-ui, sans-serif; text-align: start; }
+#poster:not([hidden]) ~ #error { inset: auto 12px 12px; }
 #error * { margin: 0; }
 #error p { margin-top: 6px; opacity: 0.8; }
 #error .facts { font: 12px/1.5 ui-monospace, Menlo, Consolas, monospace; overflow-wrap: anywhere; }
@@ -67,7 +79,7 @@ function sharedSheet() {
 const Base = globalThis.HTMLElement ?? /** @type {typeof HTMLElement} */ (class {});
 
 export class CsplatView extends Base {
-  static observedAttributes = ['src', 'alt', 'aria-label', 'crossorigin', ...WISHES];
+  static observedAttributes = ['src', 'alt', 'aria-label', 'poster', 'crossorigin', ...WISHES];
 
   /** @type {SceneViewer | null} */
   #showing = null;
@@ -76,12 +88,18 @@ export class CsplatView extends Base {
   #hasFailed = false;
   #root = this.attachShadow({ mode: 'open' });
   #canvas = made('canvas');
+  #poster = made('img', { id: 'poster', part: 'poster', alt: '', loading: 'lazy' });
   #bar = made('div', { id: 'bar' });
   #progress = made('div', { id: 'progress', role: 'progressbar', 'aria-label': 'Loading the scene' }, this.#bar);
   #error = made('section', { id: 'error', role: 'alert' });
   #observer = new IntersectionObserver((seen) => this.#seen(seen[seen.length - 1].isIntersecting), {
     rootMargin: AHEAD,
   });
+  #hasDrawn = false;
+  #isPosterBroken = false;
+  #cameraTimer = 0;
+  /** Resolves when the scene is shown, or has failed. @type {Promise<unknown>} */
+  #loading = Promise.resolve();
   /** Content of a blob: URL, fetched at once like an image's. @type {{src: string, blob: Promise<Blob>} | null} */
   #held = null;
   /** @type {import('./types.d.ts').FetchOptions} */
@@ -92,8 +110,12 @@ export class CsplatView extends Base {
     this.#progress.hidden = true;
     this.#error.hidden = true;
     this.#root.adoptedStyleSheets = [sharedSheet()];
-    this.#root.append(this.#canvas, this.#progress, this.#error);
+    this.#root.append(made('div', { id: 'box' }), this.#canvas, this.#poster, this.#progress, this.#error);
     this.#renewCanvas();
+    this.#poster.addEventListener('error', () => {
+      this.#isPosterBroken = true;
+      this.#showPoster();
+    });
     // Properties that were set before this script had run hide those of the class.
     for (const name of [...FETCHING, 'crossOrigin', ...REFLECTED]) {
       if (!Object.hasOwn(this, name)) continue;
@@ -112,7 +134,7 @@ export class CsplatView extends Base {
     for (const name of REFLECTED) {
       define(name, {
         get() {
-          return this.getAttribute(name) ?? '';
+          return name === 'camera' ? this.#camera : (this.getAttribute(name) ?? '');
         },
         set(value) {
           reflect(this, name, value);
@@ -148,6 +170,22 @@ export class CsplatView extends Base {
     return this.#showing?.engine ?? null;
   }
 
+  get #camera() {
+    return this.#showing?.camera ?? null;
+  }
+
+  /**
+   * Make an image of the scene, see `CsplatViewElement`.
+   *
+   * @param {import('./types.d.ts').PictureOptions<import('./types.d.ts').FileCamera>} [options]
+   * @returns {Promise<Blob>}
+   */
+  async toBlob(options) {
+    await this.#loading;
+    if (this.#showing) return this.#showing.toBlob(options);
+    throw new EngineError({ code: E_INPUT, message: 'no picture can be made: the element has not loaded a scene' });
+  }
+
   /** @param {FocusOptions} [options] */
   focus(options) {
     this.#canvas.focus(options);
@@ -176,8 +214,50 @@ export class CsplatView extends Base {
     // The same address again is another try, as of an image.
     if (before === after && !(name === 'src' && this.#hasFailed)) return;
     if (name === 'alt' || name === 'aria-label') this.#label();
-    else if (name === 'background' && this.#showing) this.#showing.setBackground(this.#wishes().background);
-    else this.#renew();
+    else if (name === 'poster') this.#setPoster();
+    else if (!this.#showing || this.#isStale || !this.#adapt(name, this.#showing)) this.#renew();
+  }
+
+  /**
+   * Adapt the scene that is shown to an attribute.
+   *
+   * @param {string} name
+   * @param {SceneViewer} showing
+   * @returns {boolean} false if that is impossible: it has to be loaded again
+   */
+  #adapt(name, showing) {
+    const wishes = this.#wishes(name === 'view' ? ['camera', 'view'] : [name, 'view']);
+    if (name === 'background') return showing.setBackground(wishes.background);
+    if (name === 'controls') {
+      showing.rig.limits = wishes.limits;
+      this.#label();
+      return true;
+    }
+    if (name !== 'camera' && name !== 'view') return false;
+    void showing.useCameras(wishes).then((complaint) => {
+      complain(complaint);
+      if (!complaint) this.#forgetMove();
+    });
+    return true;
+  }
+
+  /** Leave out the event of a movement that is over. */
+  #forgetMove() {
+    clearTimeout(this.#cameraTimer);
+    this.#cameraTimer = 0;
+  }
+
+  #setPoster() {
+    this.#isPosterBroken = false;
+    const address = this.getAttribute('poster');
+    if (address) this.#poster.src = address;
+    this.#showPoster();
+  }
+
+  /** Show the poster until there is a picture of the scene. */
+  #showPoster() {
+    this.#poster.hidden = this.#hasDrawn || this.#isPosterBroken || !this.getAttribute('poster');
+    this.#label();
   }
 
   /** Fetch the content of a blob: URL at once, before the page revokes it. */
@@ -198,14 +278,14 @@ export class CsplatView extends Base {
     queueMicrotask(() => {
       this.#isStale = false;
       this.#stop();
-      if (this.#isNear) void this.#start();
+      if (this.#isNear) this.#loading = this.#start();
     });
   }
 
   /** @param {boolean} isNear whether the element is near the window */
   #seen(isNear) {
     this.#isNear = isNear;
-    if (isNear && !this.#showing && !this.#isStale) void this.#start();
+    if (isNear && !this.#showing && !this.#isStale) this.#loading = this.#start();
   }
 
   async #start() {
@@ -218,9 +298,19 @@ export class CsplatView extends Base {
       this.#wishes(),
       {
         calm: () => matchMedia('(prefers-reduced-motion: reduce)').matches,
+        moved: () => {
+          this.#cameraTimer ||= window.setTimeout(() => {
+            this.#cameraTimer = 0;
+            if (this.#camera) this.#tell('camerachange', this.#camera);
+          }, CAMERA_MS);
+        },
         progress: (progress) => this.#progressed(progress),
-        frame: () => {
+        frame: (stats) => {
           if (!this.#hasFailed && !canvas.getContext('webgl2')?.isContextLost()) this.#error.hidden = true;
+          if (this.#hasDrawn || stats.firstPictureMs === 0) return;
+          this.#hasDrawn = true;
+          this.#showPoster();
+          this.#tell('firstpicture', { ...stats });
         },
         shown: (stats) => {
           this.#progress.hidden = true;
@@ -235,8 +325,7 @@ export class CsplatView extends Base {
     this.#bar.style.transform = 'scaleX(0)';
     this.#progress.hidden = false;
     if (!(await showing.start())) return;
-    const complaint = await showing.readCameras();
-    if (complaint) console.warn(`csplat-view: ${complaint}`);
+    complain(await showing.readCameras());
     const held = this.#held;
     const source = held?.src === src ? await held.blob.catch(() => src) : src;
     if (this.#showing === showing) await showing.show(source);
@@ -256,6 +345,8 @@ export class CsplatView extends Base {
     if (!this.#showing) return;
     this.#showing.close();
     this.#showing = null;
+    this.#hasDrawn = false;
+    this.#forgetMove();
     this.#hasFailed = false;
     this.#progress.hidden = true;
     this.#error.hidden = true;
@@ -264,7 +355,7 @@ export class CsplatView extends Base {
   }
 
   #renewCanvas() {
-    const canvas = made('canvas', { tabindex: '0', role: 'application', 'aria-roledescription': '3D scene' });
+    const canvas = made('canvas', { 'aria-roledescription': '3D scene' });
     const { classList } = canvas;
     canvas.addEventListener('click', () => canvas.matches(':hover') && classList.add('active'));
     canvas.addEventListener('pointerdown', () => classList.remove('keys'));
@@ -275,7 +366,7 @@ export class CsplatView extends Base {
     const hadFocus = this.#root.activeElement === this.#canvas;
     this.#canvas.replaceWith(canvas);
     this.#canvas = canvas;
-    this.#label();
+    this.#showPoster();
     if (hadFocus) canvas.focus({ preventScroll: true });
   }
 
@@ -290,13 +381,22 @@ export class CsplatView extends Base {
 
   #label() {
     const what = this.getAttribute('alt') || this.getAttribute('aria-label') || '3D scene';
-    this.#canvas.setAttribute('aria-label', `${what.replace(/\.?$/, '.')} ${HOW}`);
+    const controls = this.getAttribute('controls') ?? '';
+    const how = HOW[readWishes(new URLSearchParams({ controls })).wishes.limits.kind];
+    const canvas = this.#canvas;
+    canvas.setAttribute('aria-label', how ? `${what.replace(/\.?$/, '.')} ${how}` : what);
+    canvas.setAttribute('role', how ? 'application' : 'img');
+    if (how) canvas.tabIndex = 0;
+    else canvas.removeAttribute('tabindex');
+    canvas.hidden = this.#hasFailed && !this.#poster.hidden; // then the poster stands for the scene
+    this.#poster.alt = canvas.hidden ? what : '';
   }
 
-  #wishes() {
-    const given = WISHES.map((name) => [name, this.getAttribute(name) ?? '']).filter(([, value]) => value !== '');
+  /** @param {string[]} names of the attributes that are read */
+  #wishes(names = WISHES) {
+    const given = names.map((name) => [name, this.getAttribute(name) ?? '']).filter(([, value]) => value !== '');
     const { wishes, complaints } = readWishes(new URLSearchParams(given));
-    for (const complaint of complaints) console.warn(`csplat-view: ${complaint}`);
+    complaints.forEach(complain);
     return wishes;
   }
 
@@ -315,6 +415,7 @@ export class CsplatView extends Base {
     // The scene stays usable: the connection is tried again, and damaged parts are drawn coarsely.
     if (report.code !== E_CONTEXT && !report.fatal) return this.#tell('error', report);
     this.#hasFailed = report.fatal;
+    this.#label();
     this.#progress.hidden = true;
     const { title, advice, facts } = explain(report, nameOf(this.getAttribute('src') ?? ''));
     const paragraphs = [made('strong', {}, title), made('p', {}, advice), made('p', { class: 'facts' }, facts)];
@@ -331,6 +432,11 @@ export class CsplatView extends Base {
   #tell(type, detail) {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
+}
+
+/** @param {string} text '' for nothing */
+function complain(text) {
+  if (text) console.warn(`csplat-view: ${text}`);
 }
 
 /**

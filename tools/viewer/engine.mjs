@@ -7,7 +7,7 @@
 //   engine.setCamera({ viewmat, fx: 700, fy: 700, cx: 400, cy: 300 });
 //   await engine.open('scene.csplat');
 
-import { NO_CAMERA, viewOf } from './camera_maths.mjs';
+import { NO_CAMERA, completeSize, fitCamera, viewOf } from './camera_maths.mjs';
 import { EngineError, E_CONTEXT, E_INPUT, E_LIMIT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
 import { answer, sendable } from './fetch_port.mjs';
 import { FrameScheduler } from './frame_scheduler.mjs';
@@ -21,6 +21,7 @@ export { EngineError };
  * @typedef {import('./types.d.ts').Camera} Camera
  * @typedef {import('./types.d.ts').Engine} Engine
  * @typedef {import('./types.d.ts').EngineOptions} EngineOptions
+ * @typedef {import('./types.d.ts').Background} Background
  * @typedef {import('./types.d.ts').View} View
  * @typedef {import('./worker.mjs').Reply} Reply
  * @typedef {import('./worker.mjs').Request} Request
@@ -94,6 +95,9 @@ function aimsOf({ splatBudget, pixelError }, sort) {
   return { budget: splatBudget ?? usual, pixels: pixelError ?? (saves ? SAVING_PIXELS : USUAL_PIXELS), around: !saves };
 }
 
+/** Pixels of the largest picture that `toBlob` makes: 8192 × 8192, of 1 GiB in binary32. */
+const PIXELS_MAX = 2 ** 26;
+
 /** How often a scene is opened anew because its file was replaced, before that is an error. */
 const REPLACEMENTS = 3;
 
@@ -110,6 +114,12 @@ export async function heldBlob(url, own = fetch) {
   }
 }
 
+/**
+ * @param {Background} background
+ * @returns {number[]} red, green, blue, alpha, premultiplied
+ */
+const premultiplied = (background) => (background === 'transparent' ? [0, 0, 0, 0] : [...background, 1]);
+
 /** @implements {Engine} */
 class SplatEngine {
   /**
@@ -121,7 +131,10 @@ class SplatEngine {
     this.canvas = canvas;
     this.renderer = renderer;
     this.options = options;
-    this.look = { background: options.background ?? [0, 0, 0], shDegree: Infinity };
+    this.look = { background: premultiplied(options.background ?? [0, 0, 0]), shDegree: Infinity };
+    this.size = { width: canvas.width, height: canvas.height };
+    /** Whether the view is that of `toBlob`, not that of the canvas. */
+    this.isPicturing = false;
     /** @type {Camera | null} */
     this.camera = null;
     /** @type {View | null} */
@@ -232,21 +245,34 @@ class SplatEngine {
    * @param {number} height
    */
   setSize(width, height) {
-    if (this.canvas.width !== width) this.canvas.width = width;
-    if (this.canvas.height !== height) this.canvas.height = height;
+    this.size = { width, height };
     this.updateView();
   }
 
   updateView() {
     this.requestFrame();
-    if (this.camera === null) return;
-    this.view = viewOf(this.camera, this.canvas.width, this.canvas.height);
-    this.tell({ type: 'view', id: ++this.viewId, view: this.view });
+    if (this.isPicturing) return;
+    const { canvas, camera } = this;
+    const { width, height } = this.size;
+    if (canvas.width !== width) canvas.width = width;
+    if (canvas.height !== height) canvas.height = height;
+    if (camera === null) return;
+    this.view = viewOf(camera, width, height);
+    this.sortFor(this.view);
   }
 
-  /** @param {[number, number, number]} background */
+  /** @param {View} view that the worker decodes and sorts for */
+  sortFor(view) {
+    this.tell({ type: 'view', id: ++this.viewId, view });
+  }
+
+  /** @param {Background} background */
   setBackground(background) {
-    this.look.background = background;
+    if (background === 'transparent' && this.options.background !== 'transparent') {
+      const message = "the engine was made with an opaque background: pass background: 'transparent' to createEngine";
+      throw new EngineError({ code: E_INPUT, message });
+    }
+    this.look.background = premultiplied(background);
     this.requestFrame();
   }
 
@@ -269,10 +295,17 @@ class SplatEngine {
     }
   }
 
-  /** Resolves when everything that the current camera requires is decoded and sorted. */
-  async sorted() {
+  /**
+   * Resolves when everything that the current view requires is decoded and sorted.
+   *
+   * @param {SceneLoad} [scene] rejects if another one is opened
+   */
+  async sorted(scene) {
     for (;;) {
       if (this.opening?.error) throw this.opening.error;
+      if (scene && this.opening !== scene) {
+        throw new EngineError({ code: E_REPLACED, message: 'the scene was opened anew, or another one' });
+      }
       if (this.isSorted()) return;
       await new Promise((/** @type {(value: void) => void} */ resolve) => this.waiting.push(resolve));
     }
@@ -283,10 +316,60 @@ class SplatEngine {
   }
 
   async readPixels() {
-    await this.sorted();
-    this.frames.skip();
-    this.drawNow(); // immediately, since a browser may clear the canvas
-    return this.renderer.readPixels();
+    await this.settled();
+    return this.frames.between(async () => {
+      const { width, height } = this.canvas;
+      return this.renderer.pixelsOf(this.view ?? viewOf(NO_CAMERA, width, height), this.look);
+    });
+  }
+
+  /** @param {import('./types.d.ts').PictureOptions} [options] */
+  toBlob(options = {}) {
+    return this.frames.between(async () => {
+      this.isPicturing = true; // the canvas keeps its picture
+      try {
+        return await this.picture(options);
+      } catch (error) {
+        if (!(error instanceof RangeError)) throw error;
+        throw new EngineError({ code: E_LIMIT, message: `no picture was made: ${error.message}` });
+      } finally {
+        this.isPicturing = false;
+        if (this.opening) this.updateView();
+      }
+    });
+  }
+
+  /**
+   * @param {import('./types.d.ts').PictureOptions} options
+   * @throws {RangeError} a picture that is too large
+   */
+  async picture({ width, height, camera, type = 'image/png', quality }) {
+    const refuse = (/** @type {string} */ message, code = E_INPUT) => new EngineError({ code, message });
+    const { opening, renderer } = this;
+    const own = camera ?? this.camera;
+    if (this.frames.isClosed) throw refuse('the engine was closed before the picture was made', E_REPLACED);
+    if (opening === null || own === null) throw refuse('no picture can be made: no scene is open, or no camera is set');
+    const size = completeSize({ width, height }, this.size);
+    const shown = `${size.width} × ${size.height} pixels`;
+    if (![size.width, size.height].every((side) => Number.isInteger(side) && side > 0)) {
+      throw refuse(`the size of the picture is ${shown}, expected whole numbers above 0`);
+    }
+    const { sideMax } = renderer.capabilities;
+    if (Math.max(size.width, size.height) > sideMax || size.width * size.height > PIXELS_MAX) {
+      throw new RangeError(`${shown}, at most ${sideMax} on each side and ${PIXELS_MAX} altogether are possible`);
+    }
+    /** @type {View} */
+    let view;
+    try {
+      view = viewOf(camera ?? fitCamera(own, this.size, size), size.width, size.height);
+    } catch (error) {
+      throw refuse(`the camera of the picture: ${error}`);
+    }
+    this.sortFor(view);
+    await this.sorted(opening);
+    const pixels = await this.renderer.pixelsOf(view, this.look);
+    if (pixels.length === 0) throw refuse('the GPU was lost before the picture was made', E_CONTEXT);
+    return encodeImage(pixels, view, type, quality);
   }
 
   /** @param {[number, number, number]} up */
@@ -462,4 +545,31 @@ class SplatEngine {
     if (opening && !opening.error) this.begin(opening.source, opening.settle);
     this.requestFrame();
   }
+}
+
+/**
+ * Encode a picture.
+ *
+ * @param {Uint8Array<ArrayBuffer>} pixels RGBA, premultiplied, changed in place
+ * @param {{width: number, height: number}} size
+ * @param {string} type of the image
+ * @param {number} [quality] of an image with losses
+ * @returns {Promise<Blob>}
+ */
+async function encodeImage(pixels, { width, height }, type, quality) {
+  for (let at = 0; at < pixels.length; at += 4) {
+    const alpha = pixels[at + 3];
+    if (alpha === 255 || alpha === 0) continue;
+    for (let c = at; c < at + 3; c++) pixels[c] = Math.min(255, Math.round((pixels[c] * 255) / alpha));
+  }
+  const canvas = Object.assign(document.createElement('canvas'), { width, height });
+  const context = canvas.getContext('2d');
+  const data = new ImageData(new Uint8ClampedArray(pixels.buffer), width, height);
+  context?.putImageData(data, 0, 0);
+  const blob = await new Promise((/** @type {(blob: Blob | null) => void} */ resolve) =>
+    context ? canvas.toBlob(resolve, type, quality) : resolve(null),
+  );
+  if (!blob) throw new RangeError(`${width} × ${height} pixels, more than this browser can encode`);
+  if (blob.type === type) return blob;
+  throw new EngineError({ code: E_INPUT, message: `this browser cannot encode ${type}; image/png is always possible` });
 }

@@ -35,13 +35,29 @@ export class FrameScheduler {
 
   /** Resolves when the requested frame has been drawn, whether or not the page is visible. */
   async settle() {
-    await this.current;
+    while (this.isBusy) await this.current;
     if (this.isWanted && !this.isClosed) await this.now();
   }
 
-  /** Cancel the request: the frame has been drawn by other means. */
-  skip() {
-    this.isWanted = false;
+  /**
+   * Do other work between two frames.
+   *
+   * @template T
+   * @param {() => Promise<T>} work
+   * @returns {Promise<T>}
+   */
+  async between(work) {
+    while (this.isBusy) await this.current;
+    this.isBusy = true;
+    const done = work().finally(() => {
+      this.isBusy = false;
+      if (this.isWanted && !this.isClosed) this.schedule();
+    });
+    this.current = done.then(
+      () => {},
+      () => {},
+    );
+    return done;
   }
 
   async now() {

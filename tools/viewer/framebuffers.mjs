@@ -113,10 +113,10 @@ export class Picture {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  /** Draw it to the canvas. */
-  show() {
+  /** @param {WebGLFramebuffer | null} target where to draw it; null for the canvas */
+  show(target) {
     const { gl } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, this.width, this.height);
     gl.disable(gl.BLEND);
     gl.activeTexture(gl.TEXTURE0 + UNITS.uPicture);
@@ -124,16 +124,28 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** @returns {Uint8Array} the canvas, top row first */
+  /**
+   * Return it as bytes, top row first.
+   *
+   * @throws {RangeError} too little memory on the GPU
+   */
   read() {
     const { gl, width, height } = this;
-    const rows = new Uint8Array(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rows);
-    const out = new Uint8Array(rows.length);
+    const texture = makeTexture(gl, gl.RGBA8, width, height);
+    const { framebuffer } = makeFramebuffer(gl, [texture]);
+    this.show(framebuffer);
     const stride = 4 * width;
-    for (let y = 0; y < height; y++) out.set(rows.subarray(y * stride, (y + 1) * stride), (height - 1 - y) * stride);
-    return out;
+    const pixels = new Uint8Array(stride * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    for (let low = 0, high = height - 1; low < high; low++, high--) {
+      const row = pixels.slice(low * stride, (low + 1) * stride);
+      pixels.copyWithin(low * stride, high * stride, (high + 1) * stride);
+      pixels.set(row, high * stride);
+    }
+    gl.deleteFramebuffer(framebuffer);
+    gl.deleteTexture(texture);
+    if (gl.getError() === gl.OUT_OF_MEMORY) throw new RangeError('the GPU has too little memory');
+    return pixels;
   }
 
   dispose() {

@@ -2,7 +2,7 @@
 // The page: an engine, a camera that the user moves, and the overlay.
 //
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
-// &backend=webgl2
+// &controls=none&backend=webgl2
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
 import { E_CONTEXT, E_INPUT } from './engine_error.mjs';
@@ -102,8 +102,11 @@ function backgrounds() {
 function otherBackground(step) {
   const all = backgrounds();
   shade = (shade + step) % all.length;
-  showing.engine?.setBackground(all[shade]);
-  const colour = `rgb(${all[shade].map((value) => Math.round(255 * value))})`;
+  const background = all[shade];
+  showing.engine?.setBackground(background);
+  const isClear = background === 'transparent';
+  document.documentElement.classList.toggle('clear', isClear);
+  const colour = isClear ? background : `rgb(${background.map((value) => Math.round(255 * value))})`;
   document.querySelector('meta[name=theme-color]')?.setAttribute('content', colour); // colours the bars of a phone's browser
 }
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The interactive camera: position, pivot, and lens fitted to the canvas. Independent of the DOM.
 
+import { fitCamera, fitScale } from './camera_maths.mjs';
 import {
   add,
   cross,
@@ -34,6 +35,10 @@ import {
  * @property {number[]} [viewmat] exact matrix of a file, 16 numbers by rows, until the camera moves
  *
  * @typedef {{viewmat: number[], fx: number, fy: number, cx: number, cy: number, near: number}} EngineCamera
+ *
+ * What users may do: everything, orbit a pivot that stays, or nothing; distance to the pivot, scene units; angle at the pivot
+ * between up and the camera, radians.
+ * @typedef {{kind: 'free' | 'orbit' | 'none', distance: [number, number], polar: [number, number]}} Limits
  */
 
 const POLE = 0.02; // minimum angle between the line of sight and the vertical, radians
@@ -43,6 +48,9 @@ const NEAR_SHARE = 0.1; // maximum distance of the near plane, as a share of the
 
 /** Default field of view of the shorter side of the canvas, radians. */
 export const FIELD_OF_VIEW = (55 * Math.PI) / 180;
+
+/** @type {Limits} */
+const NO_LIMITS = { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI] };
 
 /** @returns {Lens} the default lens */
 export function defaultLens() {
@@ -57,14 +65,16 @@ export function defaultLens() {
  * @param {number} width
  * @param {number} height
  */
-const fit = (lens, width, height) => Math.min(width / lens.W, height / lens.H);
+const fit = ({ W, H }, width, height) => fitScale({ width: W, height: H }, { width, height });
 
 export class OrbitCamera {
   /**
    * @param {Pose} pose
    * @param {number} extent size of the scene, the unit of speeds and limits
+   * @param {Limits} [limits]
    */
-  constructor(pose, extent) {
+  constructor(pose, extent, limits = NO_LIMITS) {
+    this.limits = limits;
     this.pose = pose;
     this.home = pose;
     this.extent = extent;
@@ -84,19 +94,16 @@ export class OrbitCamera {
    */
   camera(width, height) {
     const { basis, eye, lens, near, distance, viewmat } = this.pose;
-    const k = fit(lens, width, height);
+    const { W, H, ...pinhole } = lens;
     const [right, down, forward] = basis;
     return {
+      ...fitCamera(pinhole, { width: W, height: H }, { width, height }),
       viewmat: viewmat ?? [
         ...[...right, -dot(right, eye)],
         ...[...down, -dot(down, eye)],
         ...[...forward, -dot(forward, eye)],
         ...[0, 0, 0, 1],
       ],
-      fx: lens.fx * k,
-      fy: lens.fy * k,
-      cx: lens.cx * k + (width - lens.W * k) / 2,
-      cy: lens.cy * k + (height - lens.H * k) / 2,
       near: viewmat ? near : Math.min(near, NEAR_SHARE * distance),
     };
   }
@@ -147,7 +154,9 @@ export class OrbitCamera {
    */
   zoom(factor, at) {
     const { basis, eye, lens, distance } = this.pose;
-    const wanted = Math.min(Math.max(distance * factor, NEAREST * this.extent), FARTHEST * this.extent);
+    const [least, most] = this.limits.distance;
+    const nearest = Math.max(NEAREST * this.extent, least);
+    const wanted = Math.min(Math.max(distance * factor, nearest), FARTHEST * this.extent, most);
     const step = distance - wanted;
     let ray = basis[2];
     if (at) {
@@ -188,6 +197,19 @@ export class OrbitCamera {
   }
 
   /**
+   * Return the nearest pose within the limits.
+   *
+   * @param {Pose} pose
+   * @returns {Pose}
+   */
+  limited(pose) {
+    const rig = new OrbitCamera(pose, this.extent, this.limits);
+    rig.orbit(0, 0);
+    rig.zoom(1);
+    return rig.pose;
+  }
+
+  /**
    * Return a pose with another up direction: the scene turns around the pivot.
    *
    * @param {Vec3} up
@@ -211,7 +233,8 @@ export class OrbitCamera {
     const { basis, up } = this.pose;
     const turned = turnBasis(basis, up, -right);
     const slope = Math.acos(Math.min(1, Math.max(-1, dot(turned[2], up)))); // 0: straight up
-    const wanted = Math.min(Math.max(slope + down, POLE), Math.PI - POLE);
+    const [least, most] = this.limits.polar.map((angle) => Math.PI - angle).reverse();
+    const wanted = Math.min(Math.max(slope + down, POLE, least), Math.PI - POLE, most);
     // An initial view that is rolled has a tilted horizon, and pitches around the horizontal axis of its picture.
     return turnBasis(turned, turned[0], slope - wanted);
   }

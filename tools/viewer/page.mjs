@@ -13,7 +13,8 @@ import { unitDirection } from './vectors.mjs';
  * @property {import('./vectors.mjs').Vec3 | null} seems up direction if nothing else specifies it
  * @property {string | null} axes directions of +x, +y, +z; override the file's
  * @property {{width: number, height: number} | null} size size of the drawing buffer, pixels
- * @property {[number, number, number] | null} background 0 to 1; overrides the file's
+ * @property {import('./types.d.ts').Background | null} background overrides the file's
+ * @property {import('./orbit_camera.mjs').Limits} limits of the controls
  * @property {boolean} ui false to show only the scene
  * @property {import('./types.d.ts').Backend} backend what draws
  *
@@ -26,6 +27,8 @@ import { unitDirection } from './vectors.mjs';
 
 const UP = /^[-+.\de]+(?:,[-+.\de]+){2}$/i;
 const AXES = /^(?=.*[RL])(?=.*[UD])(?=.*[FB])[RLUDFB]{3}$/;
+const LIMIT = '(?:orbit|(?:min|max)-(?:distance|polar)=(?:\\d+\\.?|\\d*\\.\\d+))';
+const CONTROLS = new RegExp(`^\\s*(?:none|${LIMIT}(?:\\s+${LIMIT})*)\\s*$`);
 const THREE = 'three numbers as 0,-1,0';
 
 /** @returns {Embedded | null} */
@@ -50,7 +53,11 @@ export function readWishes(query) {
     return found;
   };
   const size = match('size', /^([1-9]\d{0,3})x([1-9]\d{0,3})$/, 'width and height as 800x600');
-  const colour = match('background', /^#?([\da-f]{2})([\da-f]{2})([\da-f]{2})$/i, 'a colour as ff8800');
+  const colour = match(
+    'background',
+    /^(?:transparent|#?([\da-f]{2})([\da-f]{2})([\da-f]{2}))$/i,
+    'transparent or a colour as ff8800',
+  );
   /** @param {string} name */
   const direction = (name) => {
     const numbers = match(name, UP, THREE);
@@ -60,6 +67,12 @@ export function readWishes(query) {
   };
   const axes = match('axes', AXES, 'three letters as RDF');
   const backend = match('backend', /^(auto|webgl2|webgpu(-tiles|-quads)?)$/, 'auto, webgl2 or webgpu');
+  const controls = match('controls', CONTROLS, 'none, or limits as orbit min-distance=1 max-polar=90');
+  let limits = limitsOf(controls?.[0] ?? '');
+  if ([limits.distance, limits.polar].some(([least, most]) => least > most)) {
+    complaints.push(`controls is “${query.get('controls')}”, expected minima below the maxima`);
+    limits = limitsOf('');
+  }
   const view = match('view', /^\d{1,6}$/, 'a number from 0');
   return {
     wishes: {
@@ -70,11 +83,31 @@ export function readWishes(query) {
       seems: direction('seems'),
       axes: axes?.[0] ?? null,
       size: size && { width: Number(size[1]), height: Number(size[2]) },
-      background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : null,
+      background: colour && /** @type {any} */ (colour[1] ? colour.slice(1).map(share) : 'transparent'),
+      limits,
       ui: query.get('ui') !== '0',
       backend: /** @type {import('./types.d.ts').Backend} */ (backend?.[0] ?? 'auto'),
     },
     complaints,
+  };
+}
+
+/** @param {string} two hexadecimal digits */
+const share = (two) => parseInt(two, 16) / 255;
+
+/**
+ * @param {string} text valid
+ * @returns {import('./orbit_camera.mjs').Limits}
+ */
+function limitsOf(text) {
+  /** @type {(name: string, usual: number) => number} */
+  const value = (name, usual) => Number(new RegExp(`${name}=(\\S+)`).exec(text)?.[1] ?? usual);
+  const kind = /** @type {'none' | 'orbit' | undefined} */ (/none|orbit/.exec(text)?.[0]) ?? 'free';
+  const radians = (/** @type {number} */ degrees) => (degrees * Math.PI) / 180;
+  return {
+    kind,
+    distance: [value('min-distance', 0), value('max-distance', Infinity)],
+    polar: [radians(value('min-polar', 0)), radians(value('max-polar', 180))],
   };
 }
 

@@ -23,11 +23,16 @@ import { WebGpuRenderer } from './webgpu.mjs';
  * @property {string} name name of the device, as reported by the driver
  * @property {PictureFormat} pictureFormat format of the picture before it is shown
  * @property {number} splatsMax maximum number of splats
+ * @property {number} sideMax maximum width and height of a picture, pixels
  * @property {boolean} sorts whether it culls and sorts on the GPU, and needs no order
  *
  * Bytes on the GPU: attributes and tables; the order of splats; render targets and projected splats.
  *
  * @typedef {{attributes: number, order: number, work: number}} Bytes
+ *
+ * How to draw: the background, red, green, blue and alpha, premultiplied, 0 to 1; SH bands up to a degree.
+ *
+ * @typedef {{background: number[], shDegree: number}} Look
  *
  * Draws splats, each in a slot. The order must not contain splats that are not there. All methods but `dispose` may do nothing after the context or the GPU is lost.
  *
@@ -45,9 +50,10 @@ import { WebGpuRenderer } from './webgpu.mjs';
  * @property {() => void} complete everything has been uploaded: free reserved memory
  * @property {(order: Uint32Array, count: number) => void} setOrder slots, farthest first
  * @property {(tiles: Uint32Array) => void} setCut the tiles to draw, for renderers that sort; all if it is never called
- * @property {(view: import('./types.d.ts').View, look: {background: number[], shDegree: number}) => void} draw to the
- *   canvas, which has the size of the view
- * @property {() => Uint8Array | Promise<Uint8Array>} readPixels the result of the preceding `draw`, RGBA, top row first
+ * @property {(view: import('./types.d.ts').View, look: Look) => void} draw to the canvas, which has the size of the view
+ * @property {(view: import('./types.d.ts').View, look: Look) => Uint8Array<ArrayBuffer> | Promise<Uint8Array<ArrayBuffer>>} pixelsOf draw a picture of
+ *   any size and return it: RGBA, premultiplied, top row first; empty if the GPU is lost. Throws a RangeError if there is not
+ *   enough memory
  * @property {() => Promise<void>} finished resolves when the GPU has completed its work
  * @property {() => void | Promise<void>} wait do the same, synchronously if possible
  * @property {() => void} dispose free everything
@@ -65,11 +71,12 @@ import { WebGpuRenderer } from './webgpu.mjs';
  * Create a back end.
  *
  * @param {HTMLCanvasElement} canvas
- * @param {Pick<import('./types.d.ts').EngineOptions, 'backend' | 'pictureFormat'>} options
+ * @param {Pick<import('./types.d.ts').EngineOptions, 'backend' | 'background' | 'pictureFormat'>} options
  * @param {Losses} losses
  * @returns {Promise<Renderer | null>} null if there is none
  */
-export async function createRenderer(canvas, { backend = 'auto', pictureFormat }, losses) {
-  const renderer = backend === 'webgl2' ? null : await WebGpuRenderer.create(canvas, backend, losses);
-  return renderer ?? WebGl2Renderer.create(canvas, pictureFormat);
+export async function createRenderer(canvas, { backend = 'auto', background, pictureFormat }, losses) {
+  const alpha = background === 'transparent';
+  const renderer = backend === 'webgl2' ? null : await WebGpuRenderer.create(canvas, backend, alpha, losses);
+  return renderer ?? WebGl2Renderer.create(canvas, alpha, pictureFormat);
 }

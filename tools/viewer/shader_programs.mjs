@@ -120,11 +120,11 @@ export class ShaderPrograms {
     this.gl.useProgram(this.splat.program);
   }
 
-  /** @param {number[]} background */
-  useResolve([red, green, blue]) {
+  /** @param {number[]} background red, green, blue, alpha, premultiplied */
+  useResolve(background) {
     const { gl, resolve } = this;
     gl.useProgram(resolve.program);
-    gl.uniform3f(resolve.at('uBackground'), red, green, blue);
+    gl.uniform4fv(resolve.at('uBackground'), background);
   }
 
   dispose() {

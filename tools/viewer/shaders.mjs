@@ -164,10 +164,11 @@ void main() {
 /** Adds the background behind the blended splats. */
 export const RESOLVE_FRAGMENT = `${HEAD}
 uniform sampler2D uPicture;
-uniform vec3 uBackground;
+uniform vec4 uBackground; // premultiplied
 out vec4 oColour;
 
 void main() {
   vec4 sum = texelFetch(uPicture, ivec2(gl_FragCoord.xy), 0);
-  oColour = vec4(clamp(sum.rgb + (1.0 - sum.a) * uBackground, 0.0, 1.0), 1.0);
+  sum += (1.0 - sum.a) * uBackground;
+  oColour = vec4(clamp(sum.rgb, 0.0, sum.a), sum.a);
 }`;

@@ -111,9 +111,7 @@ export class TileStream {
     described.catch(() => {}); // it is waited for below
     const nodes = nodesOrTiles(header, header.coarseTiles.length > 0 ? await reader.nodes() : []);
     Object.assign(amounts, { phase: 'layers', fileSize: header.fileSize, splatCount: header.splatCount });
-    const isLocal = typeof source !== 'string' || /^(blob|data):/.test(source); // the decoder reports no parts of these
-    if (isLocal) amounts.received = header.indexSize;
-    const stream = new TileStream(reader, nodes, sink, aims, amounts, isLocal, signal, connection);
+    const stream = new TileStream(reader, nodes, sink, aims, amounts, signal, connection);
     // What is shown first comes together with the description.
     if (stream.hasLevels)
       reader.prefetch(
@@ -131,17 +129,15 @@ export class TileStream {
    * @param {Sink} sink
    * @param {Aims} aims
    * @param {Amounts} amounts
-   * @param {boolean} isLocal
    * @param {AbortSignal} signal
    * @param {{isLost: boolean}} connection
    */
-  constructor(reader, nodes, sink, aims, amounts, isLocal, signal, connection) {
+  constructor(reader, nodes, sink, aims, amounts, signal, connection) {
     this.reader = reader;
     this.nodes = nodes;
     this.sink = sink;
     this.aims = aims;
     this.amounts = amounts;
-    this.isLocal = isLocal;
     this.connection = connection;
     this.all = allTiles(reader.header);
     const roots = nodes.filter(({ parent }) => parent === null);
@@ -223,7 +219,6 @@ export class TileStream {
     const wasComplete = this.isComplete;
     const parts = this.#missing();
     if (this.isComplete && !wasComplete) {
-      if (this.isLocal && !this.hasLevels) this.amounts.received = this.amounts.fileSize;
       this.sink.progress(this.amounts);
       this.sink.complete();
     }
@@ -331,7 +326,6 @@ export class TileStream {
     this.connection.isLost = false;
     amounts.decodeMs += performance.now() - reader.waitedMs - begun;
     amounts.layer = place.layer;
-    if (this.isLocal) amounts.received += place.size;
     this.sink.progress(amounts);
   }
 

@@ -9,7 +9,7 @@ const FOCAL = 12; // pixels
 const LEVELS = 100; // of opacity
 const TOLERANCE = 2; // of 255
 const DILATION = 0.3;
-const BACKGROUND = [0, 0, 1];
+const BACKGROUND = [0, 0, 1, 1];
 const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 
 /** Two balls of a radius of one unit on the axis of the camera, the farther one first. */
@@ -36,7 +36,7 @@ export function warmUp(renderer) {
   const view = putTrialScene(renderer);
   renderer.setOrder(Uint32Array.of(0, 1), BALLS.length);
   for (let time = 0; time < 2; time++) {
-    renderer.draw(view, { background: [0, 0, 0], shDegree: 0 });
+    renderer.draw(view, { background: [0, 0, 0, 1], shDegree: 0 });
     renderer.allocate(null);
   }
 }
@@ -52,7 +52,7 @@ export async function isSound(renderer) {
   let isRight = true;
   for (const method of [renderer.tiles, renderer.quads]) {
     renderer.use(method);
-    const pixels = await renderer.pixelsOf({ view, look: { background: BACKGROUND, shDegree: 0 } });
+    const pixels = await renderer.pixelsOf(view, { background: BACKGROUND, shDegree: 0 });
     for (const [x, y] of PIXELS) {
       expectedAt(x, y).forEach((value, c) => {
         isRight &&= Math.abs(255 * value - pixels[4 * (SIZE * y + x) + c]) <= TOLERANCE;
@@ -101,7 +101,7 @@ function putTrialScene(renderer) {
  * @param {number} y
  */
 function expectedAt(x, y) {
-  let colour = BACKGROUND;
+  let colour = BACKGROUND.slice(0, 3);
   for (const { depth, opacity, sh0 } of BALLS) {
     const variance = (FOCAL / depth) ** 2 + DILATION;
     const squared = (x + 0.5 - SIZE / 2) ** 2 + (y + 0.5 - SIZE / 2) ** 2;

@@ -111,10 +111,37 @@ export type PictureFormat = 'RGBA16F' | 'RGBA32F' | 'RGBA8';
  */
 export type Backend = 'auto' | 'webgl2' | 'webgpu' | 'webgpu-tiles' | 'webgpu-quads';
 
+/** Red, green, blue, 0 to 1, or nothing: the page shows behind the scene. */
+export type Background = [number, number, number] | 'transparent';
+
+/** How `toBlob` makes a picture. */
+export interface PictureOptions<T = Camera> {
+  /** Pixels. If one is missing, the shape of the canvas is kept; if both are, its size at full resolution. */
+  width?: number;
+  height?: number;
+  /** Default: the current camera, so that at least all that the canvas shows is in the picture. */
+  camera?: T;
+  /** Default: image/png. Only this type and image/webp keep a transparent background. */
+  type?: string;
+  /** Quality of an image with losses, 0 to 1. */
+  quality?: number;
+}
+
+/** A camera as in camera files and in the metadata of scenes (spec 5.4). */
+export interface FileCamera {
+  /** 3 × 3, rows of the intrinsic matrix of a picture of W by H pixels. */
+  K: number[][];
+  /** 4 × 4, by rows: world → camera, as of Camera. */
+  viewmat: number[][];
+  W: number;
+  H: number;
+  near?: number;
+}
+
 /** The options of FetchOptions apply to scenes that are URLs; after its opening, a scene is retried without end by default. */
 export interface EngineOptions extends FetchOptions {
-  /** Red, green, blue, 0 to 1. */
-  background?: [number, number, number];
+  /** Default: black. Only an engine made with `transparent` can be transparent later. */
+  background?: Background;
   /** Creates the worker that decodes and sorts. */
   workerFactory?: () => Worker;
   /** What draws. Default: auto. */
@@ -149,14 +176,21 @@ export interface Engine {
   setCamera(camera: Camera): void;
   /** Set the size of the drawing buffer, pixels. */
   setSize(width: number, height: number): void;
-  setBackground(background: [number, number, number]): void;
+  setBackground(background: Background): void;
   /** Show SH bands up to this degree. */
   setShDegree(degree: number): void;
   requestFrame(): void;
   /** Resolves when everything that the current camera requires is decoded, sorted, and drawn. */
   settled(): Promise<void>;
-  /** Return the settled picture: RGBA, top row first. */
+  /** Return the settled picture: RGBA, premultiplied by alpha, top row first. */
   readPixels(): Promise<Uint8Array>;
+  /**
+   * Make an image of the scene, of any size, when everything that it requires is decoded; the canvas keeps its picture until
+   * then. While the page is hidden, it waits for what a file with levels of detail still requires. `camera` is in pixels of the
+   * image. Rejects with an EngineError: E_INPUT for invalid options, E_LIMIT for more
+   * pixels than possible, E_REPLACED if another scene is opened, E_CONTEXT if the GPU is lost, or that of the scene.
+   */
+  toBlob(options?: PictureOptions): Promise<Blob>;
   /** Return the scene's file with an up direction, a unit vector, in its metadata. */
   fileWithUp(up: [number, number, number]): Promise<Uint8Array<ArrayBuffer>>;
   /**
@@ -175,12 +209,18 @@ export interface Engine {
 export interface CsplatViewElement extends HTMLElement {
   src: string;
   alt: string;
-  /** JSON, an object or list of the same form, or a URL. */
-  camera: string | object;
+  /**
+   * The current camera; null before the scene is placed. Set it to a camera, a list of cameras, JSON of either or its URL: the
+   * camera moves there at once, without an event.
+   */
+  get camera(): FileCamera | null;
+  set camera(value: FileCamera | readonly FileCamera[] | string | URL | null);
   view: string | number;
   up: string | readonly number[];
   axes: string;
   background: string;
+  poster: string;
+  controls: string;
   backend: Backend | '';
   crossOrigin: 'anonymous' | 'use-credentials' | null;
   /** How scenes are fetched; used from the next `src` on. */
@@ -191,6 +231,8 @@ export interface CsplatViewElement extends HTMLElement {
   timeoutMs: FetchOptions['timeoutMs'];
   /** Null before the element loads and after it has left the page. */
   readonly engine: Engine | null;
+  /** Make an image as `Engine.toBlob` does. Default size with a camera: W by H. */
+  toBlob(options?: PictureOptions<FileCamera>): Promise<Blob>;
 }
 
 declare global {

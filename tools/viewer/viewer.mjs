@@ -3,8 +3,10 @@
 // element (element.mjs) are built on it.
 
 import { Controls } from './controls.mjs';
+import { readCamera } from './autocamera.mjs';
+import { completeSize, fitCamera } from './camera_maths.mjs';
 import { createEngine } from './engine.mjs';
-import { E_REPLACED, EngineError } from './engine_error.mjs';
+import { E_INPUT, E_REPLACED, EngineError } from './engine_error.mjs';
 import { fetchCameras } from './page.mjs';
 import { OrbitCamera } from './orbit_camera.mjs';
 import { CameraList, emptyPose } from './camera_list.mjs';
@@ -13,6 +15,7 @@ import { CanvasSize } from './canvas_size.mjs';
 /**
  * @typedef {import('./types.d.ts').Engine} Engine
  * @typedef {import('./types.d.ts').ErrorReport} ErrorReport
+ * @typedef {import('./types.d.ts').FileCamera} FileCamera
  * @typedef {import('./types.d.ts').Progress} Progress
  * @typedef {import('./types.d.ts').Stats} Stats
  *
@@ -20,6 +23,7 @@ import { CanvasSize } from './canvas_size.mjs';
  * @property {() => boolean} calm whether the user prefers no animations
  * @property {() => void} [header] called when `view.facts` holds the file's metadata
  * @property {() => void} [placed] called when the camera may have been placed
+ * @property {() => void} [moved] called when the camera has moved, other than by `useCameras`
  * @property {(progress: Progress) => void} progress
  * @property {(stats: Stats) => void} frame called when a frame has been drawn
  * @property {(stats: Stats) => void} shown called when the scene has been drawn completely
@@ -46,7 +50,10 @@ export class SceneViewer {
     this.turn = 0; // number of scenes so far; discards late results of earlier scenes
     this.isOpening = false;
     this.isClosed = false;
-    this.rig = new OrbitCamera(emptyPose(), 1);
+    this.isSetting = false;
+    this.hasAlpha = wishes.background === 'transparent';
+    this.rig = new OrbitCamera(emptyPose(), 1, wishes.limits);
+    this.known = this.rig.pose;
     this.stage = new CanvasSize(canvas, wishes.size, () => this.draw());
     /** @type {Controls} */
     this.controls = new Controls(
@@ -56,6 +63,9 @@ export class SceneViewer {
         moved: () => {
           this.stage.moved();
           this.draw();
+          const hasMoved = this.rig.pose !== this.known;
+          this.known = this.rig.pose;
+          if (hasMoved && !this.isSetting) hooks.moved?.();
         },
         pivotAt: (x, y) => this.view.pivotAt(x, y, canvas.clientWidth, canvas.clientHeight),
         calm: hooks.calm,
@@ -71,10 +81,15 @@ export class SceneViewer {
     return this.wishes.background ?? this.view.facts.background ?? BLACK;
   }
 
-  /** @param {[number, number, number] | null} wanted null for the scene's own */
+  /**
+   * @param {import('./types.d.ts').Background | null} wanted null for the scene's own
+   * @returns {boolean} false if the canvas cannot be transparent
+   */
   setBackground(wanted) {
+    if (wanted === 'transparent' && !this.hasAlpha) return false;
     this.wishes = { ...this.wishes, background: wanted };
     this.engine?.setBackground(this.background);
+    return true;
   }
 
   /**
@@ -122,16 +137,71 @@ export class SceneViewer {
     return this.engine;
   }
 
+  /** The current camera; null before the scene is placed. @returns {FileCamera | null} */
+  get camera() {
+    if (!this.view.bounds) return null;
+    const { width: W, height: H } = this.stage.full;
+    const { viewmat: m, fx, fy, cx, cy, near } = this.rig.camera(W, H);
+    const K = [
+      [fx, 0, cx],
+      [0, fy, cy],
+      [0, 0, 1],
+    ];
+    return { K, viewmat: [0, 4, 8, 12].map((row) => m.slice(row, row + 4)), W, H, near };
+  }
+
+  /**
+   * Show other cameras, the first one at once.
+   *
+   * @param {Pick<import('./page.mjs').Wishes, 'camera' | 'view'>} wanted
+   * @returns {Promise<string>} an error message, or ''
+   */
+  async useCameras({ camera, view }) {
+    this.wishes = { ...this.wishes, camera, view };
+    const complaint = await this.readCameras();
+    if (complaint || this.wishes.camera !== camera) return complaint;
+    this.isSetting = true;
+    this.view.showFirst();
+    this.isSetting = false;
+    return '';
+  }
+
+  /**
+   * Make an image of the scene, see `Engine.toBlob`.
+   *
+   * @param {import('./types.d.ts').PictureOptions<FileCamera>} [options]
+   * @returns {Promise<Blob>}
+   */
+  async toBlob({ camera, width, height, ...others } = {}) {
+    const refuse = (/** @type {string} */ message) => new EngineError({ code: E_INPUT, message });
+    if (!this.engine || !this.view.bounds) throw refuse('no picture can be made: no scene is shown');
+    if (!camera) {
+      const size = completeSize({ width, height }, this.stage.full);
+      return this.engine.toBlob({ ...others, ...size, camera: this.rig.camera(size.width, size.height) });
+    }
+    /** @type {ReturnType<typeof readCamera>} */
+    let read;
+    try {
+      read = readCamera(camera);
+    } catch (error) {
+      throw refuse(error instanceof Error ? error.message : String(error));
+    }
+    const { W, H, ...pinhole } = read.lens;
+    const from = { width: W, height: H };
+    const size = completeSize({ width, height }, from);
+    return this.engine.toBlob({ ...others, ...size, camera: { ...read, ...fitCamera(pinhole, from, size) } });
+  }
+
   /**
    * Read the requested cameras; an invalid one does not prevent the scene from loading.
    *
    * @returns {Promise<string>} an error message, or ''
    */
   async readCameras() {
-    const { camera, view } = this.wishes;
-    if (camera === null) return '';
+    const { camera } = this.wishes;
     try {
-      this.view.useCameras(await fetchCameras(camera, this.fetching), view);
+      const entries = camera === null ? null : await fetchCameras(camera, this.fetching);
+      if (this.wishes.camera === camera) this.view.useCameras(entries, this.wishes.view);
       return '';
     } catch (error) {
       return `The camera cannot be used: ${error instanceof Error ? error.message : error}`;

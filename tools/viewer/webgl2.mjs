@@ -24,11 +24,12 @@ import { SOFTWARE } from './webgpu_device.mjs';
 export class WebGl2Renderer {
   /**
    * @param {HTMLCanvasElement} canvas
+   * @param {boolean} alpha whether the canvas may be transparent
    * @param {PictureFormat} [format] format of the picture, used if available
    */
-  static create(canvas, format) {
+  static create(canvas, alpha, format) {
     const gl = canvas.getContext('webgl2', {
-      alpha: false,
+      alpha,
       antialias: false,
       depth: false,
       stencil: false,
@@ -54,6 +55,7 @@ export class WebGl2Renderer {
       name,
       pictureFormat: this.picture.format,
       splatsMax: gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW_TEXELS,
+      sideMax: Math.min(gl.getParameter(gl.MAX_TEXTURE_SIZE), ...gl.getParameter(gl.MAX_VIEWPORT_DIMS)),
       sorts: false,
     };
     /** @type {SceneTextures | null} */
@@ -121,11 +123,29 @@ export class WebGl2Renderer {
 
   /**
    * @param {View} view
-   * @param {{background: number[], shDegree: number}} look
+   * @param {import('./renderer.mjs').Look} look
    */
-  draw(view, { background, shDegree }) {
+  draw(view, look) {
+    if (this.#blend(view, look)) this.picture.show(null);
+  }
+
+  /**
+   * @param {View} view
+   * @param {import('./renderer.mjs').Look} look
+   */
+  pixelsOf(view, look) {
+    const pixels = this.#blend(view, look) && this.picture.read();
+    return pixels && !this.gl.isContextLost() ? pixels : new Uint8Array(0);
+  }
+
+  /**
+   * @param {View} view
+   * @param {import('./renderer.mjs').Look} look
+   * @returns {boolean} whether there is a picture
+   */
+  #blend(view, { background, shDegree }) {
     const { gl, scene, programs, picture } = this;
-    if (gl.isContextLost() || !(view.width > 0 && view.height > 0)) return;
+    if (gl.isContextLost() || !(view.width > 0 && view.height > 0)) return false;
     picture.resize(view.width, view.height);
     picture.clear();
     if (scene !== null && scene.count > 0) {
@@ -144,11 +164,7 @@ export class WebGl2Renderer {
       }
     }
     programs.useResolve(background);
-    picture.show();
-  }
-
-  readPixels() {
-    return this.picture.read();
+    return true;
   }
 
   finished() {

@@ -23,7 +23,8 @@ import * as WGSL from './wgsl.mjs';
  * @typedef {import('./types.d.ts').Backend} Backend
  * @typedef {import('./types.d.ts').View} View
  * @typedef {ScreenTiles | Quads} Method
- * @typedef {{view: View, look: {background: number[], shDegree: number}}} Picture
+ * @typedef {import('./renderer.mjs').Look} Look
+ * @typedef {{view: View, look: Look}} Picture
  */
 
 const COUNTER_BYTES = 16;
@@ -36,14 +37,15 @@ export class WebGpuRenderer {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {Backend} backend `auto` requires hardware that draws a small scene as it should
+   * @param {boolean} alpha whether the canvas may be transparent
    * @param {Losses} losses
    * @returns {Promise<WebGpuRenderer | null>} null if the browser has no WebGPU
    */
-  static async create(canvas, backend, { lost, failed }) {
+  static async create(canvas, backend, alpha, { lost, failed }) {
     const device = await Device.open(backend === 'auto').catch(() => null);
     if (!device) return null;
     const renderer = new WebGpuRenderer(device, backend);
-    if ((backend === 'auto' && !(await isSound(renderer))) || !renderer.show(canvas)) {
+    if ((backend === 'auto' && !(await isSound(renderer))) || !renderer.show(canvas, alpha)) {
       renderer.dispose();
       return null;
     }
@@ -83,6 +85,7 @@ export class WebGpuRenderer {
       name: '',
       pictureFormat: 'RGBA32F',
       splatsMax: Math.floor(device.bindingMax / BLOCK_BYTES) * BLOCK_SPLATS,
+      sideMax: device.device.limits.maxTextureDimension2D,
       sorts: true,
     };
     this.use(this.method);
@@ -98,13 +101,14 @@ export class WebGpuRenderer {
    * Draw on a canvas from now on.
    *
    * @param {HTMLCanvasElement} canvas
+   * @param {boolean} alpha whether it may be transparent
    * @returns {boolean} whether it can
    */
-  show(canvas) {
+  show(canvas, alpha) {
     const { device } = this;
     this.context = canvas.getContext('webgpu');
     const format = navigator.gpu.getPreferredCanvasFormat();
-    this.context?.configure({ device: device.device, format, alphaMode: 'opaque' });
+    this.context?.configure({ device: device.device, format, alphaMode: alpha ? 'premultiplied' : 'opaque' });
     this.presentOnCanvas = presentPipelines(device, format);
     return this.context !== null;
   }
@@ -188,7 +192,7 @@ export class WebGpuRenderer {
 
   /**
    * @param {View} view
-   * @param {{background: number[], shDegree: number}} look
+   * @param {Look} look
    */
   draw(view, look) {
     if (this.device.isLost || !this.context || !(view.width > 0 && view.height > 0)) return;
@@ -248,36 +252,34 @@ export class WebGpuRenderer {
     pass.end();
   }
 
-  async readPixels() {
-    await this.finished();
-    if (!this.last || this.device.isLost) return new Uint8Array(0);
-    return this.pixelsOf(this.last);
-  }
-
   /**
-   * Draw a picture that fits the buffers, and read it.
-   *
-   * @param {Picture} picture
-   * @returns {Promise<Uint8Array>} RGBA, top row first
+   * @param {View} view
+   * @param {Look} look
    */
-  async pixelsOf(picture) {
+  async pixelsOf(view, look) {
     const { device } = this;
-    const { width, height } = picture.view;
+    const { width, height } = view;
+    if (device.isLost || !(width > 0 && height > 0)) return new Uint8Array(0);
     const texture = device.picture(width, height, 'rgba8unorm');
-    this.#drawTo(texture, this.present, this.method, picture);
     const bytesPerRow = Math.ceil((4 * width) / 256) * 256;
     const buffer = device.buffer(bytesPerRow * height);
-    const encoder = device.device.createCommandEncoder();
-    encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, [width, height]);
-    device.device.queue.submit([encoder.finish()]);
-    const words = await device.read(buffer, bytesPerRow * height);
-    const pixels = new Uint8Array(4 * width * height);
-    const rows = new Uint8Array(words?.buffer ?? new ArrayBuffer(0));
-    for (let y = 0; y < height; y++)
-      pixels.set(rows.subarray(y * bytesPerRow, y * bytesPerRow + 4 * width), 4 * width * y);
-    device.free(buffer);
-    device.free(texture);
-    return pixels;
+    try {
+      do this.#drawTo(texture, this.present, this.method, { view, look });
+      while (!(await this.#isComplete(view)));
+      const encoder = device.device.createCommandEncoder();
+      encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, [width, height]);
+      device.device.queue.submit([encoder.finish()]);
+      const words = await device.read(buffer, bytesPerRow * height);
+      if (!words) return new Uint8Array(0);
+      const pixels = new Uint8Array(4 * width * height);
+      const rows = new Uint8Array(words.buffer);
+      for (let y = 0; y < height; y++)
+        pixels.set(rows.subarray(y * bytesPerRow, y * bytesPerRow + 4 * width), 4 * width * y);
+      return pixels;
+    } finally {
+      device.free(buffer);
+      device.free(texture);
+    }
   }
 
   /**
@@ -286,7 +288,7 @@ export class WebGpuRenderer {
    */
   async finished() {
     while (this.last && !this.device.isLost) {
-      const isComplete = await this.#isComplete();
+      const isComplete = await this.#isComplete(this.last.view);
       this.hasDrawn ||= !this.device.isLost;
       if (isComplete) break;
       this.draw(this.last.view, this.last.look);
@@ -298,17 +300,21 @@ export class WebGpuRenderer {
     await this.finished();
   }
 
-  /** Return whether the last picture fitted the buffers, after making room for the next; true if the GPU is lost. */
-  async #isComplete() {
-    const { projection, partCount, method, last } = this;
+  /**
+   * Return whether the last picture fitted the buffers, after making room for the next; true if the GPU is lost.
+   *
+   * @param {View} view of the picture
+   */
+  async #isComplete(view) {
+    const { projection, partCount, method } = this;
     const counters = await this.device.read(this.counts, COUNTER_BYTES * Math.min(partCount, MOST_PARTS));
-    if (!counters || !last) return true;
+    if (!counters) return true;
     const { count } = projection.records;
     let isComplete = true;
     for (let at = 0; at < counters.length; at += COUNTER_BYTES / 4) {
       const [visible, , firstBlock] = counters.subarray(at);
       if (visible > count) {
-        await projection.divide(last.view);
+        await projection.divide(view);
         return false;
       }
       if (method === this.tiles && firstBlock * BLOCK_SPLATS < visible) isComplete = false;
@@ -364,13 +370,13 @@ function presentPipelines({ device }, format) {
 /**
  * Return the content of `Backdrop` in present.wgsl.
  *
- * @param {number[]} background
+ * @param {number[]} background red, green, blue, alpha
  * @param {number} width
  * @param {number} first
  */
 function backdropOf(background, width, first) {
   const words = new Uint32Array(8);
-  new Float32Array(words.buffer).set(background.slice(0, 3));
+  new Float32Array(words.buffer).set(background);
   words.set([width, first], 4);
   return words;
 }

@@ -576,7 +576,8 @@ fn cover(@builtin(vertex_index) corner: u32) -> @builtin(position) vec4<f32> {
   return vec4<f32>(select(-1.0, 3.0, corner == 1u), select(-1.0, 3.0, corner == 2u), 0.0, 1.0);
 }
 fn before_backdrop(colour: vec3<f32>, transmittance: f32) -> vec4<f32> {
-  return vec4<f32>(clamp(colour + transmittance * backdrop.colour.rgb, vec3<f32>(0.0), vec3<f32>(1.0)), 1.0);
+  let sum = vec4<f32>(colour, 1.0 - transmittance) + transmittance * backdrop.colour;
+  return vec4<f32>(clamp(sum.rgb, vec3<f32>(0.0), vec3<f32>(sum.a)), sum.a);
 }
 @fragment
 fn present(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {

@@ -1,8 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // Answers of servers, as they should be and as they are: each row of a table is read to its end, or refused with its reason.
 import assert from 'node:assert/strict';
+import { createReadStream } from 'node:fs';
 import { createServer } from 'node:http';
+import { dirname, join, relative } from 'node:path';
+import { Readable } from 'node:stream';
 import { test } from 'node:test';
+import { fileURLToPath, pathToFileURL } from 'node:url';
 import { brotliCompressSync, gzipSync, inflateRawSync } from 'node:zlib';
 
 import { differ, judge, retryAfter } from '../answers.mjs';
@@ -563,7 +567,7 @@ test('blob: and data: addresses are fetched once, and whole', async () => {
   await assert.rejects(CsplatReader.open(data, { signal: AbortSignal.abort(reason) }), reason);
 });
 
-test('views are sources; what is none gets a remedy', async () => {
+test('views are sources; what is none is refused', async () => {
   const pool = new Uint8Array(SIZE + 9);
   pool.set(file, 5);
   const shared = new Uint8Array(new SharedArrayBuffer(SIZE));
@@ -571,22 +575,129 @@ test('views are sources; what is none gets a remedy', async () => {
   for (const from of [file, Buffer.from(file), pool.subarray(5, SIZE + 5), new DataView(file.slice().buffer), shared]) {
     assert.equal(await readAll(from), RIGHT);
   }
-  for (const path of [
-    'scene.csplat',
-    './scene.csplat',
-    '/tmp/scene.csplat',
-    'C:\\scene.csplat',
-    'file:///tmp/a.csplat',
-    new URL('file:///a'),
-  ]) {
-    await assert.rejects(CsplatReader.open(path), { code: 'E_INPUT', message: /openAsBlob/ });
+  for (const from of [null, undefined, 7, {}]) {
+    for (const read of [decode, CsplatReader.open]) await assert.rejects(read(from), { code: 'E_INPUT' });
   }
-  for (const from of [null, undefined, 7, {}, new Response('x')])
-    await assert.rejects(CsplatReader.open(from), { code: 'E_INPUT' });
-  await assert.rejects(decode(new Response('x')), { message: /response\.arrayBuffer/ });
-  await assert.rejects(decode(new Blob([file])), { message: /blob\.arrayBuffer/ });
-  await assert.rejects(decode('scene.csplat'), { message: /CsplatReader\.open/ });
+  await assert.rejects(decode(createReadStream(ON_DISK)), { code: 'E_INPUT', message: /Readable\.toWeb/ });
 });
+
+const ON_DISK = fileURLToPath(
+  new URL('../../../conformance/csplat_conformance/vectors/valid/rich.csplat', import.meta.url),
+);
+const folder = dirname(ON_DISK);
+
+/** A stream of the file in parts of some bytes. */
+const streamed = (size = 100, of = file) =>
+  new ReadableStream({
+    start(controller) {
+      for (let at = 0; at < of.length; at += size) controller.enqueue(of.slice(at, at + size));
+      controller.close();
+    },
+  });
+
+const SOURCES = {
+  Response: () => new Response(file),
+  'Response as it arrives': () => new Response(streamed()),
+  ReadableStream: () => streamed(7),
+  'stream of Node': () => Readable.toWeb(createReadStream(ON_DISK)),
+  Blob: () => new Blob([file]),
+  path: () => ON_DISK,
+  'relative path': () => relative(process.cwd(), ON_DISK),
+  'file: URL': () => pathToFileURL(ON_DISK),
+  'its text': () => pathToFileURL(ON_DISK).href,
+  Uint8Array: () => file,
+};
+
+for (const [kind, make] of Object.entries(SOURCES)) {
+  test(`a file can be a ${kind}: progress, abort`, async () => {
+    const received = [];
+    assert.equal(await readAll(make(), { onProgress: (bytes) => received.push(bytes) }), RIGHT);
+    assert.ok(received.every((bytes, i) => bytes > (received[i - 1] ?? 0)));
+    if (kind !== 'Uint8Array') assert.ok(received.at(-1) > 0 && received.at(-1) <= SIZE);
+    const done = [];
+    const scene = await decode(make(), { onProgress: (...progress) => done.push(progress) });
+    assert.equal(hash(scene.means), hash((await decode(file)).means));
+    assert.deepEqual(done.at(-1), [scene.count, scene.count]);
+    const reason = new Error('enough');
+    const signal = AbortSignal.abort(reason);
+    await assert.rejects(decode(make(), { signal }), reason);
+    await assert.rejects(CsplatReader.open(make(), { signal }), reason);
+    const life = new AbortController();
+    const reader = await CsplatReader.open(make(), { signal: life.signal });
+    life.abort(reason);
+    await assert.rejects(reader.readTile(1), reason);
+  });
+}
+
+test('an address can be decoded whole, with one request', async () => {
+  const { fetch, requests } = scripted((asked) => (asked ? right(asked) : whole()));
+  assert.ok((await decode(URL_, { fetch })).count > 0);
+  assert.deepEqual(
+    requests.map(({ asked }) => asked),
+    [null],
+  );
+});
+
+test('an abort cancels the stream', async () => {
+  let cancelled = false;
+  const stop = new AbortController();
+  const held = new ReadableStream({
+    start: (controller) => controller.enqueue(file.slice(0, 40)),
+    cancel: () => (cancelled = true),
+  });
+  const decoding = decode(held, { signal: stop.signal });
+  setTimeout(() => stop.abort(new Error('enough')), 20);
+  await assert.rejects(decoding, /enough/);
+  await new Promise((resolve) => setTimeout(resolve, 5));
+  assert.equal(cancelled, true);
+});
+
+const UNUSABLE = {
+  'absent file': [() => join(folder, 'absent.csplat'), 'E_INPUT', /absent\.csplat.*cannot be read: ENOENT/],
+  'absent file: URL': [() => pathToFileURL(join(folder, 'absent.csplat')), 'E_INPUT', /ENOENT/],
+  folder: [() => folder, 'E_INPUT', /cannot be read/],
+  'invalid file: URL': [() => 'file://host/a.csplat', 'E_INPUT', /cannot be read/],
+  status: [() => new Response('none', { status: 404 }), 'E_INPUT', /404/],
+  'web page': [() => new Response('<!doctype html><title>a page</title>'), 'E_MAGIC', /web page/],
+  'read Response': [readResponse, 'E_INPUT', /the response: its bytes are read elsewhere/],
+  'locked stream': [() => locked(streamed()), 'E_INPUT', /the stream: its bytes are read elsewhere/],
+  'text stream': [
+    () => new Response('a').body.pipeThrough(new TextDecoderStream()),
+    'E_INPUT',
+    /neither an ArrayBuffer/,
+  ],
+  'broken stream': [() => broken(new Error('lost')), 'E_INPUT', /the stream: Error: lost/],
+  'empty Response': [() => new Response(null), 'E_TRUNCATED', /./],
+  'cut stream': [() => streamed(99, file.subarray(0, -30)), 'E_TRUNCATED', /./],
+  'cut header': [() => streamed(9, file.subarray(0, 20)), 'E_TRUNCATED', /./],
+  'long stream': [() => streamed(99, new Uint8Array([...file, 0])), 'E_TRAILING', /./],
+};
+
+async function readResponse() {
+  const response = new Response(file);
+  await response.arrayBuffer();
+  return response;
+}
+
+function locked(stream) {
+  stream.getReader();
+  return stream;
+}
+
+const broken = (error) =>
+  new ReadableStream({
+    start(controller) {
+      controller.enqueue(file.slice(0, 50));
+    },
+    pull: (controller) => controller.error(error),
+  });
+
+for (const [kind, [make, code, message]] of Object.entries(UNUSABLE)) {
+  test(`a file that is a ${kind} is refused`, async () => {
+    await assert.rejects(decode(await make()), { code, message });
+    await assert.rejects(readAll(await make()), { code, message });
+  });
+}
 
 /** Serve with a function until the test ends. */
 async function served(t, answer) {

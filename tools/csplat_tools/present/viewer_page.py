@@ -57,9 +57,12 @@ _IMPORT = re.compile(
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-# Lines of comments by file type. GLSL comments in template strings are removed, too.
-_COMMENTS = {
-    ".mjs": re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE),
+# What is left out of files by their type: comments, in modules also types, comments behind a statement (if no quote
+# follows, as in an address in a string), indentation and empty lines, also of GLSL and WGSL in template strings.
+_LEFT_OUT = {
+    ".mjs": re.compile(
+        r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n|/\*\* *@(?:(?!\*/).)*\*/ *| +// [^'\"`\n]*$|^ +|^\n", re.MULTILINE
+    ),
     ".css": re.compile(r"^/\*.*\*/\n", re.MULTILINE),
     ".html": re.compile(r"^<!--.*-->\n", re.MULTILINE),
 }
@@ -212,8 +215,8 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
 
 
 def _texts() -> dict[str, str]:
-    """Return the text files of viewer and decoder by path, without comments, which are 20 % of modules."""
-    return {path: _COMMENTS[file.suffix].sub("", file.read_text("utf-8")) for path, file in web_files().items()}
+    """Return the text files of viewer and decoder by path, without comments and indentation, a third of modules."""
+    return {path: _LEFT_OUT[file.suffix].sub("", file.read_text("utf-8")) for path, file in web_files().items()}
 
 
 def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:

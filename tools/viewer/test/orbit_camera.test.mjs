@@ -197,3 +197,27 @@ test('the shorter rotation is taken', () => {
   close([Math.abs(half.reduce((sum, value, i) => sum + value * quat[i], 0))], [1]);
   close(sub([1, 2, 3], [1, 2, 3]), [0, 0, 0]);
 });
+
+test('limits hold for the distance to the pivot and for the angle from above', () => {
+  const some = rig();
+  some.limits = { kind: 'orbit', distance: [2, 5], polar: [Math.PI / 3, Math.PI / 2] };
+  const polar = () => Math.acos(-dot(some.pose.basis[2], some.pose.up));
+  for (const [down, angle] of [
+    [9, Math.PI / 3],
+    [-9, Math.PI / 2],
+  ]) {
+    some.orbit(0.1, down);
+    close([polar()], [angle]);
+  }
+  for (const [factor, distance] of [
+    [0.01, 2],
+    [100, 5],
+  ]) {
+    some.zoom(factor);
+    close([some.pose.distance], [distance]);
+  }
+  close(pivotOf(some.pose), [0, 0, 0]);
+  const { pose } = rig();
+  close([some.limited({ ...pose, distance: 9, eye: [0, 0, -9] }).distance], [5]);
+  assert.deepEqual(pivotOf(some.limited(pose)), [0, 0, 0]);
+});

@@ -22,9 +22,21 @@ test('an empty address has no parameters', () => {
     axes: null,
     size: null,
     background: null,
+    limits: { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI] },
     ui: true,
     backend: 'auto',
   });
+});
+
+test('controls have limits, and a background may be transparent', () => {
+  const { wishes, complaints } = readWishes(
+    new URLSearchParams('background=Transparent&controls=orbit max-distance=2.5 min-polar=45%20 max-polar=90'),
+  );
+  assert.deepEqual(complaints, []);
+  const { background, limits } = wishes;
+  assert.equal(background, 'transparent');
+  assert.deepEqual(limits, { kind: 'orbit', distance: [0, 2.5], polar: [Math.PI / 4, Math.PI / 2] });
+  assert.equal(readWishes(new URLSearchParams('controls=none')).wishes.limits.kind, 'none');
 });
 
 test('every parameter is read', () => {
@@ -51,8 +63,15 @@ test('up is normalised', () => {
 });
 
 const WRONG = ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x', 'backend=cpu'];
+const LIMITS = [
+  'controls=fly',
+  'controls=min-polar=90 max-polar=80',
+  'controls=none orbit',
+  'controls=max-polar',
+  'controls=min-distance=-1',
+];
 const NOWHERE = ['up=z', 'up=0,1', 'up=0,0,0', 'up=1,2,3,4', 'up=1,e,2', 'up=1e999,0,0'];
-for (const query of [...WRONG, ...NOWHERE]) {
+for (const query of [...WRONG, ...LIMITS, ...NOWHERE]) {
   test(`${query} is reported and ignored`, () => {
     const { wishes, complaints } = readWishes(new URLSearchParams(query));
     assert.equal(complaints.length, 1);
