@@ -4,11 +4,11 @@
 // needed for longest when the memory is full. A file without levels of detail is read completely.
 
 import { CsplatReader, FormatError } from '../../codec/js/decoder.mjs';
+import { chooseWishes, looksOf, nodesOrTiles, tilesOf } from '../../codec/js/levels/level_cut.mjs';
+import { Ranges } from '../../codec/js/levels/ranges.mjs';
 import { allTiles } from '../../codec/js/tile_records.mjs';
 import { SAMPLE_COUNT, showing } from './bounds.mjs';
 import { reachClass } from './cull.mjs';
-import { chooseWishes, looksOf, nodesOrTiles, tilesOf } from './level_cut.mjs';
-import { Ranges } from './ranges.mjs';
 import { BLOCK_SPLATS, packBand, packGeometry, packRows, pagesOf } from './texels.mjs';
 
 /**

@@ -2,9 +2,9 @@
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
+import { chooseTiles } from '../../codec/js/levels/level_cut.mjs';
 import { cull } from './cull.mjs';
 import { pageFunctions } from './fetch_port.mjs';
-import { chooseTiles } from './level_cut.mjs';
 import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
 import { TileStream } from './tile_stream.mjs';
