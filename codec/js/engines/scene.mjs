@@ -2,6 +2,8 @@
 // A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';
+import { LevelScene } from '../levels/level_scene.mjs';
+import { poolSize } from '../levels/splat_pool.mjs';
 import { drawnOtherwise } from '../registry.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
@@ -38,6 +40,8 @@ export async function openScene(from, options, target, signals = []) {
     progressive,
     workers,
     maxSplats = target.maxSplats ?? usualMaxSplats(),
+    levels = false,
+    pixelError = 1,
     signal: given,
     ...others
   } = options;
@@ -51,8 +55,9 @@ export async function openScene(from, options, target, signals = []) {
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
     const { metadata } = await reader.describe({ signal });
-    const version = await chooseTiles(reader, maxSplats);
-    const { extras, shDegree: most } = reader.header;
+    const { extras, shDegree: most, coarseTiles } = reader.header;
+    const isStreamed = levels && coarseTiles.length > 0;
+    const version = isStreamed ? [] : await chooseTiles(reader, maxSplats);
     const wanted = Math.min(shDegree ?? most, most);
     const degree = Math.min(wanted, target.shDegree);
     if (degree < wanted)
@@ -61,14 +66,10 @@ export async function openScene(from, options, target, signals = []) {
     if (otherwise) onceSaid(target.name, otherwise);
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
-    return new SplatScene(
-      reader,
-      version,
-      metadata,
-      { degree, progressive: progressive === true && degree > 0, workers },
-      target,
-      life,
-    );
+    const settings = { degree, progressive: progressive === true && degree > 0 && !isStreamed, workers };
+    const scene = new SplatScene(reader, version, metadata, settings, target, life);
+    if (isStreamed) await scene.stream({ budget: maxSplats, pixels: pixelError, around: true }, others.retries);
+    return scene;
   } catch (error) {
     life.end();
     throw error;
@@ -147,12 +148,85 @@ export class SplatScene {
     this.life = life;
     /** @type {number[][]} sampled centres */
     this.sample = [];
+    /** What streams the levels of detail, if they are drawn by what the camera sees. @type {LevelScene | null} */
+    this.levels = null;
+    this.isShown = false;
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
     const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
     /** True if the tiles are mirrored, −x for x, because the engine can only rotate them. */
     this.mirrored = determinant < 0 && !mirrors;
     /** 3 × 3, by rows: makes the scene upright. */
     this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
+  }
+
+  /**
+   * Stream levels of detail from now on.
+   *
+   * @param {import('../levels/tile_stream.mjs').Aims} aims
+   * @param {number} [retries]
+   */
+  async stream(aims, retries = Infinity) {
+    const { file, life, degree, workers } = this;
+    const reader = /** @type {import('../reader.mjs').Reader} */ (/** @type {unknown} */ (this.reader));
+    reader.retries = retries; // what is drawn stays usable meanwhile
+    const turn = {
+      geometry: (/** @type {any} */ tile) => {
+        if (!this.isShown) this.sample.push(...centresOf(tile));
+        return this.geometry(tile);
+      },
+      band: (/** @type {Packed} */ band, /** @type {number} */ layer) => this.band(band, layer),
+    };
+    const options = { shDegree: degree, workers, turn, warn: console.error };
+    this.levels = await LevelScene.open(reader, aims, life.signal, options);
+    this.header = { ...file, tiles: [], splatCount: poolSize(this.levels) };
+    life.signal.addEventListener('abort', () => this.release());
+  }
+
+  /**
+   * Draw the levels of detail; resolves when the whole scene is drawn, at any level.
+   *
+   * @param {import('../levels/level_scene.mjs').TileTarget} target
+   */
+  async drawLevels(target) {
+    const levels = /** @type {LevelScene} */ (this.levels);
+    levels.start(target);
+    try {
+      await Promise.race([levels.firstPicture, levels.stream.failed]);
+    } catch (error) {
+      this.release();
+      throw error;
+    }
+  }
+
+  /**
+   * Load and draw what a camera requires.
+   *
+   * @param {ArrayLike<number>} modelView 4 × 4, by columns: from the object's coordinates to those of the camera, whose z
+   *   points backward
+   * @param {ArrayLike<number>} projection 4 × 4, by columns
+   * @param {{width: number, height: number, near: number}} picture its size in pixels; distance of the near plane
+   */
+  look(modelView, projection, { width, height, near }) {
+    const scale = Math.hypot(modelView[0], modelView[1], modelView[2]) || 1;
+    const signs = [1, -1, -1, this.mirrored ? -1 : 1];
+    const viewmat = Array.from({ length: 16 }, (_, at) => {
+      const [row, column] = [at >> 2, at & 3];
+      if (row === 3) return column === 3 ? 1 : 0;
+      return (modelView[4 * column + row] * signs[row] * (column === 0 ? signs[3] : 1)) / scale;
+    });
+    const [fx, fy] = [0.5 * width * projection[0], 0.5 * height * projection[5]];
+    const [cx, cy] = [0.5 * width * (1 - projection[8]), 0.5 * height * (1 + projection[9])];
+    this.levels?.update({ viewmat, fx, fy, cx, cy, near: near / scale, width, height });
+  }
+
+  /** @template {import('../decoder.d.ts').PackedGeometry} T @param {T} tile @returns {T} as the engine draws it */
+  geometry(tile) {
+    return this.mirrored ? mirroredGeometry(tile) : tile;
+  }
+
+  /** @template {Packed | null} T @param {T} band @param {number} layer @returns {T} as the engine draws it */
+  band(band, layer) {
+    return this.mirrored && band ? /** @type {T} */ (mirroredBand(band, layer)) : band;
   }
 
   /** Abort the load. */
@@ -185,13 +259,8 @@ export class SplatScene {
         const tile = { ...read, index: /** @type {number} */ (numbers.get(read.index)) };
         const { first } = header.tiles[tile.index];
         this.sample.push(...centresOf(tile));
-        if (!this.mirrored) yield { ...tile, first };
-        else {
-          const sh = tile.sh.map(
-            (/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1),
-          );
-          yield { ...mirroredGeometry(tile), sh, first };
-        }
+        const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => this.band(band, i + 1));
+        yield { ...this.geometry(tile), sh, first };
       }
       signal.throwIfAborted();
     } catch (error) {
@@ -230,7 +299,7 @@ export class SplatScene {
     for (const { index, first } of this.header.tiles) {
       const band = await reader.readLayer(this.indices[index], layer, { form: 'packed', signal });
       signal.throwIfAborted();
-      if (band) yield { index, first, count: band.count, sh: this.mirrored ? mirroredBand(band.sh, layer) : band.sh };
+      if (band) yield { index, first, count: band.count, sh: this.band(band.sh, layer) };
     }
   }
 
@@ -243,12 +312,16 @@ export class SplatScene {
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
-    const { file: header, metadata, bounds } = this;
+    const { file: header, metadata, bounds, levels } = this;
     const { splatCount } = this.header;
-    const complete = this.progressive ? work() : Promise.resolve(done);
+    this.isShown = true;
+    const whole = levels ? Promise.race([levels.complete, levels.stream.failed]) : Promise.resolve();
+    const complete = this.progressive ? work() : whole.then(() => done);
     // If the caller does not await `complete`, its errors would be lost.
-    complete.catch((error) => this.life.signal.aborted || console.error(error)).finally(() => this.release());
-    return { header, splatCount, metadata, bounds, complete };
+    complete
+      .catch((error) => this.life.signal.aborted || console.error(error))
+      .finally(() => levels === null && this.release());
+    return { header, splatCount, metadata, bounds, complete, levels };
   }
 
   /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */

@@ -59,9 +59,10 @@ export function nodesOrTiles({ tiles, coarseTiles }, nodes) {
  * @param {Looks} looks
  * @param {number} budget maximum number of splats, unless the coarsest nodes have more
  * @param {Set<number>} [before] `refined` of the preceding cut
+ * @param {number} [least] error, in pixels, up to which nodes stay as well
  * @returns {Cut} tiles ascending
  */
-export function chooseTiles(nodes, isHere, looks, budget, before = new Set()) {
+export function chooseTiles(nodes, isHere, looks, budget, before = new Set(), least = -1) {
   /** @type {boolean[]} whether a node's own tiles are all here */
   const isLoaded = [];
   /** @type {boolean[]} whether the node, or the nodes below it, cover its part of the scene */
@@ -79,7 +80,7 @@ export function chooseTiles(nodes, isHere, looks, budget, before = new Set()) {
   });
   const refined = refine(nodes, errors, budget, {
     must: (node) => node.children.length > 0 && !isLoaded[node.index],
-    may: ({ index }) => canRefine[index],
+    may: ({ index }) => canRefine[index] && errors[index] > least,
   });
   const tiles = nodes.flatMap(({ index, parent, firstTile, tileCount }) => {
     const isChosen = !refined.has(index) && (parent === null || refined.has(parent));

@@ -16,7 +16,33 @@ declare module 'three' {
     computeBoundingSphere(): void;
   }
   export class Matrix4 {
+    elements: number[];
     set(...rows: number[]): this;
+    multiplyMatrices(a: Matrix4, b: Matrix4): this;
+  }
+  export class Vector2 {
+    x: number;
+    y: number;
+  }
+  export class Vector3 {
+    constructor(x: number, y: number, z: number);
+  }
+  export class PerspectiveCamera {
+    near: number;
+    matrixWorldInverse: Matrix4;
+    projectionMatrix: Matrix4;
+  }
+  export class DataTexture {
+    constructor(data: ArrayBufferView, width: number, height: number, format: number, type: number);
+  }
+  export class DataArrayTexture {
+    image: { width: number; height: number; depth: number; data: ArrayBufferView };
+    format: number;
+    type: number;
+    isDataArrayTexture: boolean;
+  }
+  export class WebGLRenderer {
+    copyTextureToTexture(from: DataTexture, to: DataArrayTexture, region: null, position: Vector3): void;
   }
   export class LoadingManager {
     abortController?: AbortController;
@@ -98,8 +124,11 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
 }
 
 declare module '@sparkjsdev/spark' {
+  import type { DataArrayTexture, Matrix4, PerspectiveCamera, Vector2, WebGLRenderer } from 'three';
   export class ExtSplats {
     extra: Record<string, unknown>;
+    numSplats: number;
+    textures: [DataArrayTexture, DataArrayTexture];
     constructor(options: { extArrays: [Uint32Array, Uint32Array]; extra: Record<string, unknown>; numSplats: number });
   }
   export class PackedSplats {
@@ -118,6 +147,9 @@ declare module '@sparkjsdev/spark' {
       splatEncoding?: Record<string, number>;
     });
     matrix: { set(...rows: number[]): unknown };
+    matrixWorld: Matrix4;
+    set needsUpdate(value: boolean);
+    frameUpdate?: (frame: { renderer: WebGLRenderer; camera: PerspectiveCamera; renderSize: Vector2 }) => void;
     quaternion: { setFromRotationMatrix(matrix: unknown): unknown };
     userData: Record<string, unknown>;
     dispose(): void;
