@@ -229,6 +229,22 @@ export class SplatScene {
     return this.mirrored && band ? /** @type {T} */ (mirroredBand(band, layer)) : band;
   }
 
+  /**
+   * Return two corners of the box of the centres of all levels, not turned.
+   *
+   * @template T
+   * @param {new (x: number, y: number, z: number) => T} Vector of the engine
+   * @returns {[T, T]}
+   */
+  corners(Vector) {
+    const all = allTiles(this.file);
+    const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
+      [0, 1, 2].map((axis) => Math[side](...all.map((tile) => tile[side][axis]))),
+    );
+    if (this.mirrored) [low[0], high[0]] = [-high[0], -low[0]];
+    return [new Vector(low[0], low[1], low[2]), new Vector(high[0], high[1], high[2])];
+  }
+
   /** Abort the load. */
   abort() {
     this.life.controller.abort();

@@ -4,12 +4,18 @@
 declare module 'three' {
   export class BufferAttribute {
     constructor(array: ArrayBufferView, itemSize: number, normalized?: boolean);
+    array: any;
   }
+  export class Box3 {
+    constructor(min: Vector3, max: Vector3);
+    getBoundingSphere(target: Sphere): Sphere;
+  }
+  export class Sphere {}
   export class BufferGeometry {
     userData: object;
     attributes: Record<string, BufferAttribute>;
-    boundingBox: object | null;
-    boundingSphere: object | null;
+    boundingBox: Box3 | null;
+    boundingSphere: Sphere | null;
     addEventListener(type: string, listener: () => void): void;
     setAttribute(name: string, attribute: BufferAttribute): this;
     computeBoundingBox(): void;
@@ -25,7 +31,7 @@ declare module 'three' {
     y: number;
   }
   export class Vector3 {
-    constructor(x: number, y: number, z: number);
+    constructor(...coordinates: number[]);
   }
   export class PerspectiveCamera {
     near: number;
@@ -61,6 +67,28 @@ declare module 'three' {
   }
 }
 
+declare module 'three/addons/objects/GaussianSplat.js' {
+  import type { Matrix4, PerspectiveCamera, Sphere, Vector2 } from 'three';
+  export interface StorageAttribute {
+    array: any;
+    needsUpdate: boolean;
+    pbo?: { needsUpdate: boolean };
+    addUpdateRange(start: number, count: number): void;
+  }
+  export class GaussianSplat {
+    boundingSphere: Sphere | null;
+    matrixWorld: Matrix4;
+    onBeforeRender: (
+      renderer: { getDrawingBufferSize(target: Vector2): Vector2 },
+      scene: unknown,
+      camera: PerspectiveCamera,
+    ) => void;
+    _buffers: any;
+    _sortInitialized: boolean;
+    _sphericalHarmonicsInitialized: boolean;
+  }
+}
+
 declare module '@babylonjs/core/Misc/fileRequest.js' {
   import type { Observable } from '@babylonjs/core/Misc/observable.js';
   export interface IFileRequest {
@@ -71,18 +99,26 @@ declare module '@babylonjs/core/Misc/fileRequest.js' {
 
 declare module '@babylonjs/core/Misc/observable.js' {
   export class Observable<T> {
+    add(listener: () => void): { remove(): void };
     addOnce(listener: () => void): { remove(): void };
     notifyObservers(value: T): void;
   }
 }
 
 declare module '@babylonjs/core/scene.js' {
+  import type { Matrix } from '@babylonjs/core/Maths/math.vector.js';
   import type { Observable } from '@babylonjs/core/Misc/observable.js';
   export class Scene {
     isDisposed: boolean;
     onDisposeObservable: Observable<Scene>;
+    onBeforeRenderObservable: Observable<Scene>;
     useRightHandedSystem: boolean;
-    getEngine(): { getCaps(): { maxTextureSize: number } };
+    activeCamera: { minZ: number; getViewMatrix(): Matrix; getProjectionMatrix(): Matrix } | null;
+    getEngine(): {
+      getCaps(): { maxTextureSize: number };
+      getRenderWidth(): number;
+      getRenderHeight(): number;
+    };
   }
 }
 
@@ -99,16 +135,20 @@ declare module '@babylonjs/core/Loading/sceneLoader.js' {
 }
 
 declare module '@babylonjs/core/Maths/math.vector.js' {
-  export class Vector3 {}
+  export class Vector3 {
+    constructor(x: number, y: number, z: number);
+  }
   export class Quaternion {}
   export class Matrix {
+    multiply(other: Matrix): Matrix;
+    asArray(): ArrayLike<number>;
     static FromValues(...values: number[]): Matrix;
     decompose(scaling: Vector3, rotation: Quaternion): boolean;
   }
 }
 
 declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js' {
-  import type { Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
+  import type { Matrix, Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
   import type { Scene } from '@babylonjs/core/scene.js';
   export class GaussianSplattingMesh {
     constructor(name: string, url: string | null, scene: Scene, keepInRam?: boolean);
@@ -118,6 +158,12 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
     rotationQuaternion: Quaternion | null;
     scaling: Vector3;
     computeWorldMatrix(force: boolean): void;
+    getWorldMatrix(): Matrix;
+    getBoundingInfo(): { reConstruct(min: Vector3, max: Vector3, world: Matrix): void };
+    setSplatIndexRanges(ranges: { offset: number; count: number }[]): void;
+    _writeStreamingSplats(first: number, count: number, rows: Uint8Array): void;
+    _updateShTextureData(texture: object, data: Uint8Array, width: number, line: number, lines: number): void;
+    _shTextures: object[];
     dispose(doNotRecurse?: boolean, disposeMaterialAndTextures?: boolean): void;
     updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
   }
