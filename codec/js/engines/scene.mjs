@@ -230,14 +230,15 @@ export class SplatScene {
   }
 
   /**
-   * Return two corners of the box of the centres of all levels, not turned.
+   * Return two corners of the box of all centres, not turned.
    *
    * @template T
    * @param {new (x: number, y: number, z: number) => T} Vector of the engine
+   * @param {Header} [header] with the tiles; all levels if it is missing
    * @returns {[T, T]}
    */
-  corners(Vector) {
-    const all = allTiles(this.file);
+  corners(Vector, header) {
+    const all = header?.tiles ?? allTiles(this.file);
     const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
       [0, 1, 2].map((axis) => Math[side](...all.map((tile) => tile[side][axis]))),
     );

@@ -214,11 +214,25 @@ declare module 'playcanvas' {
     fire(name: string, ...values: unknown[]): unknown;
   }
   export interface AppBase {
-    graphicsDevice: { maxTextureSize: number };
+    graphicsDevice: { maxTextureSize: number; width: number; height: number };
+    systems: { camera: { cameras: CameraComponent[] } };
+    on(name: string, listener: () => void): void;
+    off(name: string, listener: () => void): void;
     scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean; splatBudget: number } };
   }
+  export interface CameraComponent {
+    viewMatrix: Mat4;
+    projectionMatrix: Mat4;
+    rect: { z: number; w: number };
+    nearClip: number;
+  }
   export class Entity {
-    gsplat?: { workBufferUpdate: number };
+    gsplat?: { workBufferUpdate: number; layers: number[] };
+    addComponent(name: string, data: object): void;
+    addChild(child: Entity): void;
+    getWorldTransform(): Mat4;
+    once(name: string, listener: () => void): void;
+    destroy(): void;
     setLocalRotation(rotation: Quat): void;
   }
   export class Vec3 {
@@ -227,6 +241,7 @@ declare module 'playcanvas' {
   }
   export class Mat4 {
     data: Float32Array;
+    mul2(a: Mat4, b: Mat4): this;
   }
   export class Quat {
     setFromMat4(matrix: Mat4): this;
