@@ -51,6 +51,8 @@ export interface SceneFacts<T = void> {
 export interface SceneLevels {
   /** Number of splats that are drawn now; `splatCount` of the scene is the number that there is room for. */
   readonly splatCount: number;
-  /** `isComplete` if all that the camera requires is loaded, otherwise `missing` bytes are not. */
-  readonly stream: { readonly isComplete: boolean; readonly amounts: { readonly missing: number } };
+  /** Whether all that the camera requires is drawn. */
+  readonly isComplete: boolean;
+  /** Bytes that the camera requires and that are not here. */
+  readonly missingBytes: number;
 }

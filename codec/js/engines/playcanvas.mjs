@@ -17,6 +17,7 @@ import { onceSaid } from './packed_values.mjs';
  * @typedef {import('../decoder.d.ts').Header} Header
  * @typedef {import('../levels/level_scene.mjs').LoadedTile} LoadedTile
  * @typedef {import('playcanvas').Entity} Entity
+ * @typedef {{tile: LoadedTile, resource: CsplatResource, children: Map<Entity, Entity>}} ShownTile
  */
 
 const NAME = 'csplat in PlayCanvas';
@@ -229,8 +230,10 @@ class TileEntities {
     this.app = app;
     this.scene = scene;
     this.options = options;
-    /** @type {Map<number, {tile: LoadedTile, resource: CsplatResource, children: Map<Entity, Entity>}>} */
+    /** @type {Map<number, ShownTile>} */
     this.shown = new Map();
+    /** @type {ShownTile[]} */
+    this.hidden = [];
     /** @type {Set<Entity>} */
     this.entities = new Set();
     this.look = this.look.bind(this);
@@ -244,7 +247,7 @@ class TileEntities {
       this.entities.delete(entity);
       for (const { children } of this.shown.values()) children.delete(entity);
     });
-    for (const { resource, children } of this.shown.values()) children.set(entity, childOf(entity, resource));
+    this.flush();
   }
 
   /**
@@ -252,7 +255,7 @@ class TileEntities {
    * @param {LoadedTile} tile
    */
   show(index, tile) {
-    const { scene, app, options, entities } = this;
+    const { scene, app, options } = this;
     const record = { ...allTiles(scene.file)[index], index: 0, first: 0 };
     const header = { ...scene.file, tiles: [record], splatCount: tile.count };
     const { graphicsDevice: device } = app;
@@ -263,8 +266,7 @@ class TileEntities {
       imagesOf(header, [tile], device.maxTextureSize),
       options,
     );
-    const children = new Map([...entities].map((entity) => [entity, childOf(entity, resource)]));
-    this.shown.set(index, { tile, resource, children });
+    this.shown.set(index, { tile, resource, children: new Map() });
     this.band(index);
   }
 
@@ -284,12 +286,21 @@ class TileEntities {
   /** @param {number} index */
   hide(index) {
     const one = this.shown.get(index);
+    if (one) this.hidden.push(one);
     this.shown.delete(index);
-    for (const child of one?.children.values() ?? []) child.destroy();
-    one?.resource.destroy();
   }
 
-  flush() {}
+  flush() {
+    for (const { children, resource } of this.hidden.splice(0)) {
+      for (const child of children.values()) child.destroy();
+      resource.destroy();
+    }
+    for (const { children, resource } of this.shown.values()) {
+      for (const entity of this.entities) {
+        if (!children.has(entity)) children.set(entity, childOf(entity, resource));
+      }
+    }
+  }
 
   look() {
     const [entity] = this.entities;
@@ -304,6 +315,7 @@ class TileEntities {
   destroy() {
     this.app.off('prerender', this.look);
     for (const index of [...this.shown.keys()]) this.hide(index);
+    this.flush();
   }
 }
 

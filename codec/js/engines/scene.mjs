@@ -38,7 +38,7 @@ export async function openScene(from, options, target, signals = []) {
   const {
     shDegree,
     progressive,
-    workers,
+    workers = WORKERS,
     maxSplats = target.maxSplats ?? usualMaxSplats(),
     levels = false,
     pixelError = 1,
@@ -54,22 +54,27 @@ export async function openScene(from, options, target, signals = []) {
       life.onBytes();
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
-    const { metadata } = await reader.describe({ signal });
+    const described = reader.describe({ signal });
+    described.catch(() => {}); // it is waited for below
     const { extras, shDegree: most, coarseTiles } = reader.header;
-    const isStreamed = levels && coarseTiles.length > 0;
-    const version = isStreamed ? [] : await chooseTiles(reader, maxSplats);
     const wanted = Math.min(shDegree ?? most, most);
     const degree = Math.min(wanted, target.shDegree);
+    let streamed = null;
+    if (levels && coarseTiles.length > 0) {
+      reader.retries = others.retries ?? Infinity; // what is drawn stays usable meanwhile
+      const aims = { budget: maxSplats, pixels: pixelError, around: true };
+      streamed = await LevelScene.open(/** @type {any} */ (reader), aims, signal, { shDegree: degree, workers });
+    }
+    const { metadata } = await described; // it comes together with the coarsest version
+    const version = streamed ? [] : await chooseTiles(reader, maxSplats);
     if (degree < wanted)
       onceSaid(target.name, `SH bands above ${degree} are left out: the engine ends at degree ${degree}`);
     const otherwise = drawnOtherwise(reader.header);
     if (otherwise) onceSaid(target.name, otherwise);
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
-    const settings = { degree, progressive: progressive === true && degree > 0 && !isStreamed, workers };
-    const scene = new SplatScene(reader, version, metadata, settings, target, life);
-    if (isStreamed) await scene.stream({ budget: maxSplats, pixels: pixelError, around: true }, others.retries);
-    return scene;
+    const settings = { degree, progressive: progressive === true && degree > 0 && !streamed, workers };
+    return new SplatScene(reader, version, metadata, settings, target, life, streamed);
   } catch (error) {
     life.end();
     throw error;
@@ -122,11 +127,12 @@ export class SplatScene {
    * @param {CsplatReader} reader
    * @param {TileRecord[]} version its tiles
    * @param {Record<string, unknown> | null} metadata
-   * @param {{degree: number, progressive: boolean, workers?: number}} wanted
+   * @param {{degree: number, progressive: boolean, workers: number}} wanted
    * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
    * @param {Life} life
+   * @param {LevelScene | null} [levels]
    */
-  constructor(reader, version, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
+  constructor(reader, version, metadata, { degree, progressive, workers }, { engine, mirrors }, life, levels = null) {
     /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
     /** The header of the file. */
@@ -139,8 +145,8 @@ export class SplatScene {
       splatCount += tile.splatCount;
       return { ...tile, index, first };
     });
-    /** The header of a file with this version alone. */
-    this.header = { ...reader.header, tiles, splatCount };
+    /** The header of a file with this version alone, or with room for what is streamed. */
+    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels) : splatCount };
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;
@@ -148,8 +154,8 @@ export class SplatScene {
     this.life = life;
     /** @type {number[][]} sampled centres */
     this.sample = [];
-    /** What streams the levels of detail, if they are drawn by what the camera sees. @type {LevelScene | null} */
-    this.levels = null;
+    /** What streams the levels of detail, if they are drawn by what the camera sees. */
+    this.levels = levels;
     this.isShown = false;
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
     const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
@@ -160,36 +166,21 @@ export class SplatScene {
   }
 
   /**
-   * Stream levels of detail from now on.
-   *
-   * @param {import('../levels/tile_stream.mjs').Aims} aims
-   * @param {number} [retries]
-   */
-  async stream(aims, retries = Infinity) {
-    const { file, life, degree, workers } = this;
-    const reader = /** @type {import('../reader.mjs').Reader} */ (/** @type {unknown} */ (this.reader));
-    reader.retries = retries; // what is drawn stays usable meanwhile
-    const turn = {
-      geometry: (/** @type {any} */ tile) => {
-        if (!this.isShown) this.sample.push(...centresOf(tile));
-        return this.geometry(tile);
-      },
-      band: (/** @type {Packed} */ band, /** @type {number} */ layer) => this.band(band, layer),
-    };
-    const options = { shDegree: degree, workers, turn, warn: console.error };
-    this.levels = await LevelScene.open(reader, aims, life.signal, options);
-    this.header = { ...file, tiles: [], splatCount: poolSize(this.levels) };
-    life.signal.addEventListener('abort', () => this.release());
-  }
-
-  /**
    * Draw the levels of detail; resolves when the whole scene is drawn, at any level.
    *
    * @param {import('../levels/level_scene.mjs').TileTarget} target
    */
   async drawLevels(target) {
     const levels = /** @type {LevelScene} */ (this.levels);
-    levels.start(target);
+    this.life.signal.throwIfAborted();
+    this.life.signal.addEventListener('abort', () => this.release());
+    levels.start(target, {
+      geometry: (tile) => {
+        if (!this.isShown) this.sample.push(...centresOf(tile));
+        return this.geometry(tile);
+      },
+      band: (band, layer) => this.band(band, layer),
+    });
     try {
       await Promise.race([levels.firstPicture, levels.stream.failed]);
     } catch (error) {
@@ -370,7 +361,7 @@ export class SplatScene {
   }
 }
 
-/** @param {PackedTile} tile */
+/** @param {import('../decoder.d.ts').PackedGeometry} tile */
 function centresOf({ count, means: { columns, offsets, step } }) {
   const every = Math.ceil(count / SAMPLE);
   return Array.from({ length: Math.ceil(count / every) }, (_, i) =>

@@ -3,7 +3,7 @@
 
 import { LayerWorkers } from '../workers.mjs';
 import { chooseTiles } from './level_cut.mjs';
-import { TileStream } from './tile_stream.mjs';
+import { TileStream, nextTask } from './tile_stream.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Packed} Packed
@@ -17,7 +17,8 @@ import { TileStream } from './tile_stream.mjs';
  *
  * @typedef {PackedGeometry & {sh: (Packed | null)[]}} LoadedTile
  *
- * What draws tiles. All calls until `flush` are one change of the picture: tiles are hidden first, then shown.
+ * What draws tiles. All calls until `flush` are one change of the picture, which nothing of it may alter before: tiles are
+ * hidden first, then shown, in tasks of their own.
  *
  * @typedef {object} TileTarget
  * @property {(index: number) => void} hide
@@ -41,24 +42,23 @@ export class LevelScene {
    * @param {Reader} reader
    * @param {Aims} aims
    * @param {AbortSignal} signal
-   * @param {{shDegree: number, workers: number, turn: Turn, warn: (error: unknown) => void}} options
+   * @param {{shDegree: number, workers: number}} options
    */
-  static async open(reader, aims, signal, { shDegree, workers, turn, warn }) {
+  static async open(reader, aims, signal, { shDegree, workers }) {
     const stream = await TileStream.open(reader, aims, signal, { shDegree, lanes: Math.max(1, workers) });
     stream.prefetchRoots(signal);
-    return new LevelScene(stream, signal, workers > 0 ? new LayerWorkers(reader) : null, turn, warn);
+    return new LevelScene(stream, workers > 0 ? new LayerWorkers(reader) : null);
   }
 
   /**
    * @param {TileStream} stream
-   * @param {AbortSignal} signal
    * @param {LayerWorkers | null} workers
-   * @param {Turn} turn
-   * @param {(error: unknown) => void} warn
    */
-  constructor(stream, signal, workers, turn, warn) {
+  constructor(stream, workers) {
     this.stream = stream;
-    this.signal = signal;
+    this.workers = workers;
+    /** @type {Turn} */
+    this.turn = { geometry: (tile) => tile, band: (band) => band };
     /** Tiles in memory. @type {Map<number, LoadedTile>} */
     this.loaded = new Map();
     /** Tiles that are drawn. @type {Set<number>} */
@@ -74,6 +74,8 @@ export class LevelScene {
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this.timer = undefined;
     this.changedAt = -Infinity;
+    this.isChanging = false;
+    this.isDue = false; // something has arrived or moved since the last change
     /** Number of splats that are drawn. */
     this.splatCount = 0;
     /** @type {() => void} */
@@ -91,11 +93,11 @@ export class LevelScene {
           ? workers.read(tile, layer, aborted)
           : stream.reader.readLayer(tile.index, layer, { form: 'packed', signal: aborted }),
       geometry: ({ index }, packed) => {
-        this.loaded.set(index, { ...turn.geometry(packed), sh: [] });
+        this.loaded.set(index, { ...this.turn.geometry(packed), sh: [] });
         this.#changeSoon();
       },
       band: ({ index }, layer, { sh }) => {
-        const band = turn.band(sh, layer);
+        const band = this.turn.band(sh, layer);
         /** @type {LoadedTile} */ (this.loaded.get(index)).sh[layer - 1] = band;
         if (!this.shown.has(index)) return;
         this.bands.push([index, layer, band]);
@@ -106,10 +108,20 @@ export class LevelScene {
         this.#changeSoon();
       },
       progress: () => {},
-      warn,
+      warn: console.error,
       complete: () => this.#changeSoon(),
     };
-    this.workers = workers;
+  }
+
+  /** Whether all that the camera requires is drawn. */
+  get isComplete() {
+    const { stream, view, isChanging, isDue } = this;
+    return view !== null && view === stream.view && stream.isComplete && !isChanging && !isDue;
+  }
+
+  /** Bytes that the camera requires and that are not here. */
+  get missingBytes() {
+    return this.stream.amounts.missing;
   }
 
   /** Number of splats that are drawn at most, unless the coarsest version has more. */
@@ -121,9 +133,11 @@ export class LevelScene {
    * Draw in an engine from now on.
    *
    * @param {TileTarget} target
+   * @param {Turn} turn
    */
-  start(target) {
+  start(target, turn) {
     this.target = target;
+    this.turn = turn;
     this.stream.setView(null);
   }
 
@@ -155,38 +169,53 @@ export class LevelScene {
   }
 
   #changeSoon() {
-    if (this.timer !== undefined || this.target === null) return;
+    this.isDue = true;
+    if (this.timer !== undefined || this.isChanging || this.target === null) return;
     this.timer = setTimeout(
       () => {
         this.timer = undefined;
-        this.#change();
+        this.#change(/** @type {TileTarget} */ (this.target)).catch((error) => this.stream.fail(error));
       },
       Math.max(0, this.changedAt + INTERVAL_MS - performance.now()),
     );
   }
 
-  /** Exchange the tiles that are drawn. */
-  #change() {
-    const { stream, target, view, loaded, shown, bands } = this;
-    if (target === null) return;
+  /**
+   * Exchange the tiles that are drawn, one per task, so that frames are drawn meanwhile.
+   *
+   * @param {TileTarget} target
+   */
+  async #change(target) {
+    const { stream, view, loaded, shown, bands } = this;
+    this.isChanging = true;
+    this.isDue = false;
     if (view !== null && view !== stream.view) stream.setView(view);
     const { nodes, looks, aims } = stream;
     const isHere = (/** @type {number} */ tile) => loaded.has(tile);
     const { tiles, isWhole, refined } = chooseTiles(nodes, isHere, looks, aims.budget, this.refined, aims.pixels);
     this.refined = refined;
-    const chosen = new Set(tiles);
-    const added = tiles.filter((index) => !shown.has(index));
-    const removed = [...shown].filter((index) => !chosen.has(index));
-    for (const index of removed) target.hide(index);
-    for (const [index, layer, band] of bands) if (chosen.has(index)) target.band(index, layer, band);
-    for (const index of added) target.show(index, /** @type {LoadedTile} */ (loaded.get(index)));
-    const isNew = added.length + removed.length + bands.length > 0;
-    this.shown = chosen;
+    this.shown = new Set(tiles);
     this.bands = [];
+    const removed = [...shown].filter((index) => !this.shown.has(index));
+    for (const index of removed) target.hide(index);
+    const tasks = bands
+      .filter(([index]) => this.shown.has(index) && shown.has(index))
+      .map((band) => () => target.band(...band));
+    for (const index of tiles) {
+      const tile = /** @type {LoadedTile} */ (loaded.get(index)); // it may be evicted before its turn
+      if (!shown.has(index)) tasks.push(() => target.show(index, tile));
+    }
+    for (const task of tasks) {
+      task();
+      await nextTask();
+      if (this.target === null) return;
+    }
+    if (removed.length + tasks.length > 0) target.flush();
     this.splatCount = tiles.reduce((sum, index) => sum + stream.all[index].splatCount, 0);
-    if (isNew) target.flush();
     this.changedAt = performance.now();
+    this.isChanging = false;
     if (isWhole) this.showedAll();
-    if (stream.isComplete && stream.view !== null) this.completed();
+    if (this.isDue) this.#changeSoon();
+    if (this.isComplete) this.completed();
   }
 }

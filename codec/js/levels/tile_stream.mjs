@@ -393,7 +393,7 @@ function onePage(tiles, most) {
 }
 
 /** Resolves after the messages that are already queued. */
-function nextTask() {
+export function nextTask() {
   const { port1, port2 } = new MessageChannel();
   return new Promise((/** @type {(value: void) => void} */ resolve) => {
     port1.onmessage = () => {

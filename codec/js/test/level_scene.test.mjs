@@ -68,10 +68,9 @@ async function drawn(t, source, options = {}) {
 /** Resolve when all that a camera requires is drawn. */
 async function settled(scene, modelView) {
   scene.look(modelView, PROJECTION, PICTURE);
-  const { stream } = scene.levels;
-  for (let quiet = 0; quiet < 2; quiet++) {
-    await new Promise((resolve) => setTimeout(resolve, 120));
-    while (!stream.isComplete) await Promise.race([new Promise((resolve) => setTimeout(resolve, 5)), stream.failed]);
+  const { levels } = scene;
+  while (!levels.isComplete) {
+    await Promise.race([new Promise((resolve) => setTimeout(resolve, 5)), levels.stream.failed]);
   }
 }
 
@@ -120,7 +119,7 @@ test('workers read the same layers, and no byte is requested twice', async (t) =
   const { url, requests } = await serve(t, vector(name));
   const alone = await drawn(t, new Blob([vector(name)]));
   const { scene, facts } = await drawn(t, url, { workers: 2, firstBytes: 64 });
-  for (const one of [alone.scene, scene]) await settled(one, from(1e-3));
+  for (const one of [alone.scene, scene]) await settled(one, from(300));
   await facts.complete;
   assert.ok(scene.levels.loaded.size > 1);
   assert.deepEqual(new Map([...scene.levels.loaded].sort()), new Map([...alone.scene.levels.loaded].sort()));

@@ -90,8 +90,8 @@ export const look = (camera) => stage.look(camera, shown.world);
 
 /** What is drawn of a file with levels of detail, and whether all that the camera requires is. */
 export const levels = () => {
-  const { splatCount, stream } = shown.levels;
-  return { splatCount, isComplete: stream.isComplete && stream.view !== null };
+  const { splatCount, isComplete } = shown.levels;
+  return { splatCount, isComplete };
 };
 
 /** Removes the scene. */
