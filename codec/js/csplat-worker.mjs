@@ -7,8 +7,9 @@ import { Reader } from './reader.mjs';
 /**
  * @typedef {Map<number, Uint8Array<ArrayBuffer>>} Parts of the file, by their offsets
  * @typedef {{form?: import('./decoder.d.ts').LayerForm, shDegree: number, extra: boolean}} Wanted of a tile
- * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts, spare?: any}} Request `spare`: fields whose memory may be reused
- * @typedef {{fields?: any}} Answer the arrays of a tile, or nothing if it was refused
+ * @typedef {{open: Parts, wanted: Wanted} | {tile: number, layer?: number, parts: Parts, spare?: any}} Request `layer`: to read
+ *   it alone, packed; `spare`: fields whose memory may be reused
+ * @typedef {{fields?: any}} Answer the arrays of a tile or layer, or nothing if it was refused
  */
 
 /** @type {Parts} */
@@ -34,10 +35,14 @@ async function answer(request) {
     return {};
   }
   for (const [offset, bytes] of request.parts) parts.set(offset, bytes);
+  const { tile, layer, spare } = request;
   /** @type {any} */
-  const fields = await reader.readTile(request.tile, /** @type {any} */ (wanted), request.spare);
+  const fields = await (layer === undefined
+    ? reader.readTile(tile, wanted, spare)
+    : reader.readLayer(tile, layer, { form: 'packed' }));
+  if (layer !== undefined) reader.forget(tile);
   for (const offset of request.parts.keys()) parts.delete(offset);
-  for (const { lookup } of (fields.sh ?? []).filter(Boolean)) {
+  for (const { lookup } of [fields.sh].flat().filter(Boolean)) {
     if (lookup && sent.has(lookup.table)) delete lookup.table;
     else if (lookup) sent.add(lookup.table);
   }

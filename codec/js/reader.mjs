@@ -348,8 +348,26 @@ export class Reader {
   async layerByCompiled(record, place, chunk, packed, signal) {
     if (this.compiled === null) return null;
     const { layer } = place;
+    const chunks = await this.layerChunks(record, place, chunk, signal);
+    return this.byCompiled(record, chunks, (decoder) => {
+      if (layer === spec.LAYER_GEOMETRY) return decoder.readPacked(record);
+      const sh = packed ? decoder.readPackedBand(record, layer) : decoder.readBand(record, layer);
+      return sh && { sh, count: record.splatCount };
+    });
+  }
+
+  /**
+   * Return the chunks that a layer is decoded from. Bands with the same codebook share the indices in the lowest of them,
+   * whose chunk is kept for the others.
+   *
+   * @param {TileRecord} record
+   * @param {LayerRecord} place
+   * @param {Bytes} chunk its own
+   * @param {AbortSignal} [signal]
+   */
+  async layerChunks(record, place, chunk, signal) {
+    const { layer } = place;
     const chunks = new Map([[place, chunk]]);
-    // Bands with the same codebook share the indices in the lowest of them, whose chunk is kept for the others.
     for (const { bandFirst, bandLast } of record.tables.flatMap((id) => this.codebooks.get(id) ?? [])) {
       if (bandFirst === bandLast || layer < bandFirst || layer > bandLast) continue;
       const lowest = record.layers.find((one) => one.layer === bandFirst);
@@ -358,11 +376,34 @@ export class Reader {
       this.kept.set(lowest, bytes);
       chunks.set(lowest, bytes);
     }
-    return this.byCompiled(record, chunks, (decoder) => {
-      if (layer === spec.LAYER_GEOMETRY) return decoder.readPacked(record);
-      const sh = packed ? decoder.readPackedBand(record, layer) : decoder.readBand(record, layer);
-      return sh && { sh, count: record.splatCount };
-    });
+    return chunks;
+  }
+
+  /**
+   * Collect the bytes of chunks and of the codebooks that they refer to, by offset.
+   *
+   * @param {TileRecord} record
+   * @param {Map<LayerRecord, Bytes>} chunks
+   * @returns {Promise<Map<number, Bytes>>}
+   */
+  async withTables({ tables }, chunks) {
+    const parts = new Map([...chunks].map(([{ offset }, bytes]) => [offset, bytes]));
+    const layers = [...chunks.keys()].map(({ layer }) => layer);
+    for (const [key, { id, layer, offset }] of this.codebookChunks) {
+      if (tables.includes(id) && layers.includes(layer)) parts.set(offset, await this.codebookChunk(key));
+    }
+    return parts;
+  }
+
+  /**
+   * Collect the bytes that a reader in a worker needs for a layer, by offset.
+   *
+   * @param {TileRecord} record
+   * @param {LayerRecord} place
+   * @param {AbortSignal} [signal]
+   */
+  async layerParts(record, place, signal) {
+    return this.withTables(record, await this.layerChunks(record, place, await this.fetch(place, signal), signal));
   }
 
   /**
@@ -374,13 +415,9 @@ export class Reader {
    * @param {(decoder: WasmDecoder) => T} decode
    * @returns {Promise<T | null>} null or false if WebAssembly cannot decode them: then the JavaScript modules do
    */
-  async byCompiled({ tables }, chunks, decode) {
+  async byCompiled(record, chunks, decode) {
     if (this.compiled === null) return null;
-    const parts = new Map([...chunks].map(([{ offset }, bytes]) => [offset, bytes]));
-    const layers = [...chunks.keys()].map(({ layer }) => layer);
-    for (const [key, { id, layer, offset }] of this.codebookChunks) {
-      if (tables.includes(id) && layers.includes(layer)) parts.set(offset, await this.codebookChunk(key));
-    }
+    const parts = await this.withTables(record, chunks);
     return this.compiled.reading(parts, this.checked, decode);
   }
 

@@ -161,18 +161,76 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
   }
 }
 
+/** Workers that decode layers of one file. */
+export class LayerWorkers {
+  /** @param {Reader} reader */
+  constructor(reader) {
+    this.reader = reader;
+    /** Idle workers, each with the offsets of the codebooks that it has. @type {{worker: Correspondent, known: Set<number>}[]} */
+    this.free = [];
+    /** @type {Map<string, PackedColumns>} */
+    this.tables = new Map();
+    this.isClosed = false;
+  }
+
+  /**
+   * Read a layer as `readLayer` does in form 'packed', in an idle worker or a new one.
+   *
+   * @param {TileRecord} tile
+   * @param {number} layer one that the tile has
+   * @param {AbortSignal} [signal]
+   * @returns {Promise<any>}
+   */
+  async read(tile, layer, signal) {
+    const { reader } = this;
+    const place = tile.layers.find((one) => one.layer === layer);
+    const parts = place && !reader.inflates ? await reader.layerParts(tile, place, signal) : new Map();
+    signal?.throwIfAborted();
+    const one = parts.size > 0 ? (this.free.pop() ?? (await this.#start())) : null;
+    const sent = new Map([...parts].filter(([at]) => !one?.known.has(at)).map(([at, bytes]) => [at, bytes.slice()]));
+    const offsets = [...sent.keys()];
+    const answer = await one?.worker.ask({ tile: tile.index, layer, parts: sent }).catch(() => null);
+    if (!answer?.fields) one?.worker.worker.terminate();
+    if (!one || !answer?.fields) return reader.readLayer(tile.index, layer, { form: 'packed', signal }); // reports the error
+    const chunks = tile.layers.map(({ offset }) => offset);
+    for (const offset of offsets) {
+      reader.checked.add(offset);
+      if (!chunks.includes(offset)) one.known.add(offset);
+    }
+    restore(answer.fields, this.tables, layer - 1);
+    if (this.isClosed) giveBack(one.worker);
+    else this.free.push(one);
+    return answer.fields;
+  }
+
+  async #start() {
+    const worker = await take().catch(() => null);
+    const opening = new Map([...this.reader.opening].map(([offset, bytes]) => [offset, bytes.slice()]));
+    const wanted = { shDegree: 0, extra: false };
+    const answer = await worker?.ask({ open: opening, wanted }).catch(() => null);
+    return worker && answer ? { worker, known: /** @type {Set<number>} */ (new Set()) } : null;
+  }
+
+  /** Let the workers end. */
+  close() {
+    this.isClosed = true;
+    for (const { worker } of this.free.splice(0)) giveBack(worker);
+  }
+}
+
 /**
  * Restore what messages do not carry: the prototype of the extra columns, and the identity of codebook tables, which a
  * worker sends once and which are the same objects for all tiles.
  *
  * @param {any} fields changed
  * @param {Map<string, PackedColumns>} tables
+ * @param {number} [first] band of the first of the fields
  */
-function restore(fields, tables) {
+function restore(fields, tables, first = 0) {
   if (fields.extra) fields.extra = Object.assign(Object.create(null), fields.extra);
-  for (const [band, packed] of (fields.sh ?? []).entries()) {
+  for (const [i, packed] of [fields.sh ?? []].flat().entries()) {
     if (!packed?.lookup) continue;
-    const key = `${packed.lookup.codebook}.${band}`;
+    const key = `${packed.lookup.codebook}.${first + i}`;
     if (!tables.has(key)) tables.set(key, packed.lookup.table);
     packed.lookup.table = tables.get(key);
   }

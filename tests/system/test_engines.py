@@ -3,6 +3,7 @@
 
 import shutil
 import subprocess
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -148,18 +149,53 @@ def test_disposal_leaves_nothing_on_the_gpu(trial):
     assert trial.memory()[1] <= before + 100_000
 
 
-def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files):
-    folder, _, model, camera = files
-    coarser = replace(model.select(slice(0, None, 3)), extra={})
+@pytest.fixture(scope="module")
+def coarser(files):
+    """A third of the scene: the coarser level of `levels.csplat`."""
+    folder, _, model, _ = files
+    third = replace(model.select(slice(0, None, 3)), extra={})
     groups = np.array_split(np.argsort(model.means[:, 0]), 2)
-    nodes = [LevelNode(0, 2, rows=rows) for rows in groups] + [LevelNode(1, None, splats=coarser, error=1.0)]
-    (folder / "levels.csplat").write_bytes(encode_levels(EncodePlan.of(model, FAST), nodes).write().data)
+    for name, axes in (("levels", None), ("left_levels", "LUF")):
+        whole, part = (convert_axes(Scene.of(one), axes).model() if axes else one for one in (model, third))
+        nodes = [LevelNode(0, 2, rows=rows) for rows in groups] + [LevelNode(1, None, splats=part, error=1.0)]
+        (folder / f"{name}.csplat").write_bytes(encode_levels(EncodePlan.of(whole, FAST), nodes).write().data)
+    return third
+
+
+def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files, coarser):
+    _, _, model, camera = files
     for options, wanted, other in (({"maxSplats": 2000}, coarser, model), ({}, model, coarser)):
         for more in ({}, {"progressive": True}):
             image, said = shown(trial, "levels.csplat", **options, **more)
             assert said["count"] - len(wanted) in range(16), said
             ours, others = (ENGINES[trial.engine].render(one, camera, 3) for one in (wanted, other))
             assert psnr(image, ours) > max(30.0, psnr(image, others) + 3.0)
+
+
+def test_levels_follow_the_camera(trial, files, coarser):
+    _, _, model, camera = files
+    failed = []
+    trial.page.on("console", lambda message: failed.append(message.text) if message.type == "error" else None)
+    for error, wanted, other in ((1e-3, model, coarser), (1e6, coarser, model)):
+        image, _ = shown(trial, "levels.csplat", levels=True, pixelError=error)
+        ours, others = (ENGINES[trial.engine].render(one, camera, 3) for one in (wanted, other))
+        assert psnr(image, ours) > max(30.0, psnr(image, others) + 3.0)
+        again, _ = shown(trial, "left_levels.csplat", moved=False, levels=True, pixelError=error)
+        assert psnr(again, image) > 35.0
+    before = trial.memory()[1]
+    trial.show("levels.csplat", levels=True)
+    near = pinhole(camera, model)
+    for away, count in ((1e4, len(coarser)), (0.0, len(model)), (1e4, len(coarser))):
+        view = [*near["view"][:14], near["view"][14] + away, 1.0]
+        trial.look({**near, "view": view, "far": near["far"] + away})
+        end = time.monotonic() + 60.0
+        while trial.levels() != {"splatCount": count, "isComplete": True}:
+            assert time.monotonic() < end, trial.levels()
+            time.sleep(0.1)
+    trial.remove()
+    assert [] == failed
+    if trial.engine != "three":  # it keeps its textures, of a PLY, too
+        assert trial.memory()[1] <= before + 100_000
 
 
 @pytest.mark.parametrize("engine", ["playcanvas", "babylon"])

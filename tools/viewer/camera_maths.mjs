@@ -14,9 +14,6 @@ export const DILATION = 0.3;
 /** Pixels that a splat covers with less than this alpha are skipped. */
 export const ALPHA_MIN = 1 / 255;
 
-/** Maximum distance outside the picture at which the perspective is linearised, in half-widths of the picture. */
-const FOV_MARGIN = 0.3;
-
 /** Radius at which a splat of alpha 1 falls to ALPHA_MIN, in standard deviations. */
 export const REACH_MAX = Math.sqrt(2 * Math.log(1 / ALPHA_MIN));
 
@@ -74,18 +71,6 @@ export function completeSize({ width, height }, usual) {
  * @param {{width: number, height: number}} to
  */
 export const fitScale = (from, to) => Math.min(to.width / from.width, to.height / from.height);
-
-/**
- * Return the smallest and largest x/z and y/z at which the perspective is linearised.
- *
- * @param {View} view
- * @returns {[number, number, number, number]}
- */
-export function slopeLimits({ fx, fy, cx, cy, width, height }) {
-  const marginX = (FOV_MARGIN * 0.5 * width) / fx;
-  const marginY = (FOV_MARGIN * 0.5 * height) / fy;
-  return [-cx / fx - marginX, (width - cx) / fx + marginX, -cy / fy - marginY, (height - cy) / fy + marginY];
-}
 
 /**
  * Transform a point from world to camera coordinates.

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Frustum culling: whole tiles first, then splats. Conservative compared with the shaders: no visible splat is lost.
 
-import { ALPHA_MIN, DILATION, REACH_MAX, slopeLimits } from './camera_maths.mjs';
+import { slopeLimits } from '../../codec/js/levels/level_cut.mjs';
+import { ALPHA_MIN, DILATION, REACH_MAX } from './camera_maths.mjs';
 
 /**
  * @typedef {import('./types.d.ts').View} View

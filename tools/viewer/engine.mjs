@@ -85,7 +85,7 @@ const [USUAL_PIXELS, SAVING_PIXELS] = [1, 2];
 /**
  * @param {EngineOptions} options
  * @param {boolean} sort whether the CPU sorts
- * @returns {import('./tile_stream.mjs').Aims}
+ * @returns {import('../../codec/js/levels/tile_stream.mjs').Aims}
  */
 function aimsOf({ splatBudget, pixelError }, sort) {
   const device = /** @type {{deviceMemory?: number, connection?: {saveData?: boolean}}} */ (navigator);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Growing textures that are addressed by one number, row by row.
 
-import { Ranges } from './ranges.mjs';
+import { Ranges } from '../../codec/js/levels/ranges.mjs';
 import { ROW_TEXELS } from './shader_attributes.mjs';
 
 /**

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The WebGL 2 back end. renderer.mjs documents its methods.
 
-import { slopeLimits } from './camera_maths.mjs';
+import { slopeLimits } from '../../codec/js/levels/level_cut.mjs';
 import { ShaderPrograms } from './shader_programs.mjs';
 import { SceneTextures } from './scene_textures.mjs';
 import { RECORD_COLUMNS, ROW_TEXELS } from './shader_attributes.mjs';

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // A WebGPU device with its compiled passes and growing buffers. The shaders are those of csplat_render/gpu.
 
-import { Ranges } from './ranges.mjs';
+import { Ranges } from '../../codec/js/levels/ranges.mjs';
 import * as WGSL from './wgsl.mjs';
 
 /**

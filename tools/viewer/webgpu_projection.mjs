@@ -2,7 +2,7 @@
 // Finds the splats in view, projects them into records and sorts these by depth, on the GPU. What exceeds the records is
 // drawn in slices of depth, nearest first.
 
-import { slopeLimits } from './camera_maths.mjs';
+import { slopeLimits } from '../../codec/js/levels/level_cut.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
 
 /**

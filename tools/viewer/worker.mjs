@@ -2,12 +2,12 @@
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
+import { chooseTiles } from '../../codec/js/levels/level_cut.mjs';
 import { cull } from './cull.mjs';
 import { pageFunctions } from './fetch_port.mjs';
-import { chooseTiles } from './level_cut.mjs';
 import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
-import { TileStream } from './tile_stream.mjs';
+import { TexelStream } from './texel_stream.mjs';
 
 /**
  * @typedef {import('./cull.mjs').CullTile} CullTile
@@ -17,7 +17,7 @@ import { TileStream } from './tile_stream.mjs';
  * Messages to the worker: `scene` counts the calls of `open`, `id` the cameras.
  *
  * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean,
- *      aims: import('./tile_stream.mjs').Aims, fetching: Fetching}
+ *      aims: import('../../codec/js/levels/tile_stream.mjs').Aims, fetching: Fetching}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
  *   | {type: 'pause', isPaused: boolean}
@@ -36,11 +36,11 @@ import { TileStream } from './tile_stream.mjs';
  * Messages of the worker; all carry `scene`.
  *
  * @typedef {{scene: number} & (
- *   | {type: 'header', opened: import('./tile_stream.mjs').Opened}
+ *   | {type: 'header', opened: import('./texel_stream.mjs').Opened}
  *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
  *   | {type: 'geometry', tile: number, slot: number, texels: import('./texels.mjs').GeometryTexels,
- *      samples: import('./tile_stream.mjs').Samples}
+ *      samples: import('./texel_stream.mjs').Samples}
  *   | {type: 'evict', tile: number}
  *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
  *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
@@ -74,7 +74,7 @@ class Job {
     /** @type {import('./types.d.ts').FetchOptions} */
     this.fetching = {};
     this.abort = new AbortController();
-    /** @type {TileStream | null} */
+    /** @type {TexelStream | null} */
     this.stream = null;
     /** Tiles that are drawn. @type {CullTile[]} */
     this.drawn = [];
@@ -103,7 +103,7 @@ class Job {
       this.sortSoon(0);
     } else if (request.type === 'pause') {
       this.isPaused = request.isPaused;
-      this.stream?.pause(this.isPaused);
+      this.stream?.tiles.pause(this.isPaused);
     } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
     else if (request.type === 'stop') this.reset();
     else if (this.spare.length < 2) this.spare.push(request.order);
@@ -139,11 +139,11 @@ class Job {
     const { fetch, renew } = pageFunctions((question, port) => post({ type: 'ask', question, port }, [port]));
     this.fetching = { ...fetching, ...(hasFetch && { fetch }), ...(hasRenew && { renew }) };
     try {
-      const stream = await TileStream.open(source, this.sink(post), aims, signal, this.fetching);
+      const stream = await TexelStream.open(source, this.sink(post), aims, signal, this.fetching);
       this.stream = stream;
-      stream.pause(this.isPaused);
-      stream.setView(this.camera?.view ?? null);
-      await stream.failed;
+      stream.tiles.pause(this.isPaused);
+      stream.tiles.setView(this.camera?.view ?? null);
+      await stream.tiles.failed;
     } catch (error) {
       post({ type: 'error', error: reportOf(error, true) });
       abort.abort(); // ends what is left of the reading
@@ -167,7 +167,7 @@ class Job {
 
   /**
    * @param {(message: any, transfer?: Transferable[]) => void} post
-   * @returns {import('./tile_stream.mjs').Sink}
+   * @returns {import('./texel_stream.mjs').TexelSink}
    */
   sink(post) {
     return {
@@ -206,9 +206,9 @@ class Job {
   /**
    * Choose the tiles to draw, of those that are here.
    *
-   * @param {TileStream} stream
+   * @param {TexelStream} stream
    */
-  choose({ nodes, here, looks, aims, hasLevels }) {
+  choose({ here, tiles: { nodes, looks, aims, hasLevels } }) {
     const { tiles, isWhole, refined } = chooseTiles(
       nodes,
       (tile) => here.has(tile),
@@ -246,10 +246,10 @@ class Job {
     const { stream, camera } = this;
     if (camera === null || stream === null) return;
     const { id, view } = camera;
-    if (stream.view !== view) stream.setView(view);
+    if (stream.tiles.view !== view) stream.tiles.setView(view);
     this.choose(stream);
     const { scene, splatCount, visible, isWhole } = this;
-    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete: stream.isComplete, isWhole });
+    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete: stream.tiles.isComplete, isWhole });
     if (!this.sorts) {
       this.scope.postMessage({ ...reply, order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 });
       return;

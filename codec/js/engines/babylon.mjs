@@ -6,10 +6,11 @@
 
 import { AssetContainer } from '@babylonjs/core/assetContainer.js';
 import { RegisterSceneLoaderPlugin } from '@babylonjs/core/Loading/sceneLoader.js';
-import { Matrix, Quaternion } from '@babylonjs/core/Maths/math.vector.js';
+import { Matrix, Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
 import { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js';
 import { Observable } from '@babylonjs/core/Misc/observable.js';
 
+import { SplatPool } from '../levels/splat_pool.mjs';
 import { openScene } from './scene.mjs';
 import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
@@ -22,6 +23,7 @@ const SH_ZERO = 128;
  * @typedef {import('@babylonjs/core/scene.js').Scene} Scene
  * @typedef {import('./babylon.d.ts').CSPLATLoadingOptions} CSPLATLoadingOptions
  * @typedef {import('./scene.mjs').SplatScene} SplatScene
+ * @typedef {import('../levels/level_scene.mjs').LoadedTile} LoadedTile
  */
 
 /** The plugin. */
@@ -117,7 +119,10 @@ async function meshOf(scene, opened, keepInRam = false) {
   const width = scene.getEngine().getCaps().maxTextureSize;
   const degree = opened.progressive ? 0 : opened.degree;
   const bands = new Bands(header.splatCount, degree, width);
-  const rows = await rowsOf(opened, bands);
+  const { rows, put } = rowsOf(opened, bands);
+  const drawing = opened.levels ? new Drawing(scene, opened, rows, bands, width) : null;
+  if (drawing) await opened.drawLevels(drawing.poolOf(put));
+  for await (const tile of opened.tiles()) put(tile, tile.first);
   if (scene.isDisposed) {
     opened.release();
     throw new Error('the scene was disposed before its splats had loaded');
@@ -132,6 +137,7 @@ async function meshOf(scene, opened, keepInRam = false) {
     mesh.rotationQuaternion = new Quaternion();
     upright.decompose(mesh.scaling, mesh.rotationQuaternion);
     mesh.computeWorldMatrix(true);
+    drawing?.start(mesh);
     mesh.metadata = { csplat: opened.facts(() => addBands(mesh, rows, opened, width), undefined) };
   } catch (error) {
     mesh.dispose(false, true); // with its material
@@ -142,12 +148,12 @@ async function meshOf(scene, opened, keepInRam = false) {
 }
 
 /**
+ * Return empty rows, one per splat, and what writes a tile to them.
+ *
  * @param {SplatScene} opened
  * @param {Bands} bands
- * @returns {Promise<ArrayBuffer>} one row per splat
  */
-async function rowsOf(opened, bands) {
-  const { header } = opened;
+function rowsOf({ header }, bands) {
   const rows = new ArrayBuffer(ROW_BYTES * header.splatCount);
   const floats = new Float32Array(rows);
   const numbers = places(floats, ROW_BYTES / 4, 0, 6);
@@ -155,8 +161,7 @@ async function rowsOf(opened, bands) {
   const [centreAt, scalesAt] = [numbers.slice(0, 3), numbers.slice(3)];
   const [colourAt, alphaAt, quatAt] = [bytes.slice(0, 3), bytes.slice(3, 4), bytes.slice(4)];
   const alpha = alphaOf(header);
-  for await (const tile of opened.tiles()) {
-    const { first } = tile;
+  const put = (/** @type {LoadedTile} */ tile, /** @type {number} */ first) => {
     putColumns(tile.means, centreAt, first, (value) => value);
     putColumns(tile.scales, scalesAt, first, Math.exp);
     if (header.flat) eachThinnest(tile, (i, c) => (floats[(ROW_BYTES / 4) * (first + i) + 3 + c] = 0));
@@ -164,8 +169,87 @@ async function rowsOf(opened, bands) {
     putColumns(tile.opacities, alphaAt, first, (q) => 255 * alpha(q));
     putQuats(tile.quats, header, quatAt, first, signed);
     for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
+  };
+  return { rows, put };
+}
+
+/** Draws a pool of splats, by the functions with which the engine streams SOG. */
+class Drawing {
+  /**
+   * @param {Scene} scene
+   * @param {SplatScene} opened
+   * @param {ArrayBuffer} rows
+   * @param {Bands} bands
+   * @param {number} width width of the textures
+   */
+  constructor(scene, opened, rows, bands, width) {
+    this.scene = scene;
+    this.opened = opened;
+    this.rows = rows;
+    this.bands = bands;
+    this.width = width;
+    /** @type {SplatPool | null} */
+    this.pool = null;
+    /** @type {GaussianSplattingMesh | null} */
+    this.mesh = null;
+    /** @type {[number, number][]} */
+    this.changed = [];
   }
-  return rows;
+
+  /** @param {(tile: LoadedTile, first: number) => void} put */
+  poolOf(put) {
+    this.pool = new SplatPool(this.opened.header.splatCount, {
+      put,
+      putBand: (layer, band, first) => this.bands.put(layer, band, first),
+      clear: (first, count) => this.bands.clear(first, count), // the rest is not in the ranges that are drawn
+      flush: (changed) => {
+        this.changed.push(...changed);
+        this.upload();
+      },
+    });
+    return this.pool;
+  }
+
+  /** @param {GaussianSplattingMesh} mesh with the data of the first picture */
+  start(mesh) {
+    const { opened, scene } = this;
+    this.mesh = mesh;
+    this.upload();
+    const observer = scene.onBeforeRenderObservable.add(() => this.look(mesh));
+    mesh.onDisposeObservable.addOnce(() => observer.remove());
+    mesh.getBoundingInfo().reConstruct(...opened.corners(Vector3), mesh.getWorldMatrix());
+  }
+
+  /** @param {GaussianSplattingMesh} mesh */
+  look(mesh) {
+    const { opened, scene } = this;
+    const { activeCamera: camera } = scene;
+    if (!camera) return;
+    const engine = scene.getEngine();
+    const picture = { width: engine.getRenderWidth(), height: engine.getRenderHeight(), near: camera.minZ };
+    // Matrices of row vectors have the memory layout of those of column vectors, and z may point forward.
+    const modelView = Array.from(mesh.getWorldMatrix().multiply(camera.getViewMatrix()).asArray());
+    const projection = Array.from(camera.getProjectionMatrix().asArray());
+    for (let at = 2; at < 16 && !scene.useRightHandedSystem; at += 4) modelView[at] *= -1;
+    for (let at = 8; at < 12 && !scene.useRightHandedSystem; at++) projection[at] *= -1;
+    opened.look(modelView, projection, picture);
+  }
+
+  upload() {
+    const { bands, changed, mesh, pool, rows, width } = this;
+    if (mesh === null || pool === null) return;
+    for (const [first, count] of changed) {
+      mesh._writeStreamingSplats(first, count, new Uint8Array(rows, ROW_BYTES * first, ROW_BYTES * count));
+      const line = Math.floor(first / width);
+      const lines = Math.ceil((first + count) / width) - line;
+      for (const [i, texels] of (bands.textures ?? []).entries()) {
+        mesh._updateShTextureData(mesh._shTextures[i], texels, width, line, lines);
+      }
+    }
+    this.changed = [];
+    const drawn = Array.from(pool.places.values(), ({ first: offset, tile: { count } }) => ({ offset, count }));
+    mesh.setSplatIndexRanges(drawn);
+  }
 }
 
 /**
@@ -207,6 +291,14 @@ class Bands {
    */
   put(layer, band, first) {
     putBand(band, this.places.slice(3 * (layer ** 2 - 1), 3 * ((layer + 1) ** 2 - 1)), first, signed);
+  }
+
+  /**
+   * @param {number} first splat
+   * @param {number} count
+   */
+  clear(first, count) {
+    for (const texels of this.textures ?? []) texels.fill(SH_ZERO, SH_BYTES * first, SH_BYTES * (first + count));
   }
 }
 

@@ -17,6 +17,13 @@ export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
    * phones 1,000,000; in PlayCanvas `app.scene.gsplat.splatBudget`.
    */
   maxSplats?: number;
+  /**
+   * Of a file with levels of detail, draw each part as finely as the camera requires, at most `maxSplats` splats, and load it
+   * when it is required. The load resolves with the coarsest version; `progressive` has no effect. Default: false.
+   */
+  levels?: boolean;
+  /** Error, in pixels, below which parts are not refined further; with `levels`. Default: 1. */
+  pixelError?: number;
 }
 
 /** The source of a scene. */
@@ -31,6 +38,21 @@ export interface SceneFacts<T = void> {
   metadata: Record<string, unknown> | null;
   /** A sphere around most splats of the upright scene, for an initial camera. */
   bounds: { center: number[]; radius: number };
-  /** Resolves when the SH bands are loaded: at once, unless the load was progressive. Disposal ends it. */
+  /**
+   * Resolves when the SH bands are loaded: at once, unless the load was progressive; with `levels`, when all that a camera
+   * requires is drawn for the first time. Disposal ends it.
+   */
   complete: Promise<T>;
+  /** What streams levels of detail; null if they are not drawn by what the camera sees. */
+  levels: SceneLevels | null;
+}
+
+/** Levels of detail that are streamed. */
+export interface SceneLevels {
+  /** Number of splats that are drawn now; `splatCount` of the scene is the number that there is room for. */
+  readonly splatCount: number;
+  /** Whether all that the camera requires is drawn. */
+  readonly isComplete: boolean;
+  /** Bytes that the camera requires and that are not here. */
+  readonly missingBytes: number;
 }

@@ -6,7 +6,10 @@ import type { LoadOptions, SceneFacts } from './options.d.ts';
 /** The type of `asset.resource`. Textures hold the integers of the file; the engine's `destroy` frees them and ends a load. */
 export interface CsplatResource extends GSplatResourceBase {
   csplat: SceneFacts;
-  /** Rotate an entity so that the scene is upright, by its axes and the metadata's `up`, and draw it again once complete. */
+  /**
+   * Rotate an entity so that the scene is upright, by its axes and the metadata's `up`, and draw it again once complete. With
+   * the option `levels`, entities below it draw the tiles.
+   */
   stand(entity: Entity): void;
 }
 

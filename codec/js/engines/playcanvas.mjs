@@ -4,6 +4,7 @@
 
 import * as pc from 'playcanvas';
 
+import { allTiles } from '../tile_records.mjs';
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
 import { openScene } from './scene.mjs';
 import { onceSaid } from './packed_values.mjs';
@@ -13,6 +14,10 @@ import { onceSaid } from './packed_values.mjs';
  * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
  * @typedef {import('./playcanvas-textures.mjs').Image} Image
  * @typedef {import('./scene.mjs').SplatScene} SplatScene
+ * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('../levels/level_scene.mjs').LoadedTile} LoadedTile
+ * @typedef {import('playcanvas').Entity} Entity
+ * @typedef {{tile: LoadedTile, resource: CsplatResource, children: Map<Entity, Entity>}} ShownTile
  */
 
 const NAME = 'csplat in PlayCanvas';
@@ -127,17 +132,15 @@ class CsplatResource extends pc.GSplatResourceBase {
   /**
    * @param {object} device
    * @param {SplatScene} scene
+   * @param {Header} header of the tiles in the textures
    * @param {ReturnType<typeof imagesOf>} made
    * @param {object} options
    */
-  constructor(device, scene, { images, parameters, centers }, options) {
-    const { tiles, splatCount: numSplats } = scene.header;
-    const box = (/** @type {'min' | 'max'} */ side) =>
-      new pc.Vec3(...[0, 1, 2].map((axis) => Math[side](...tiles.map((tile) => tile[side][axis]))));
-    const [low, high] = [box('min'), box('max')];
-    if (scene.mirrored) [low.x, high.x] = [-high.x, -low.x];
-    const calcAabb = (/** @type {any} */ aabb) => tiles.length && aabb.setMinMax(low, high);
-    super(device, { numSplats, shBands: 0, getCenters: () => centers, calcAabb }, options);
+  constructor(device, scene, header, { images, parameters, centers }, options) {
+    const corners = scene.corners(pc.Vec3, header);
+    const calcAabb = (/** @type {any} */ aabb) => header.tiles.length && aabb.setMinMax(...corners);
+    super(device, { numSplats: header.splatCount, shBands: 0, getCenters: () => centers, calcAabb }, options);
+    this.header = header;
     this.scene = scene;
     /** @type {{name: string, format: number}[]} */
     this.described = [];
@@ -145,6 +148,8 @@ class CsplatResource extends pc.GSplatResourceBase {
     this.entities = new Set();
     /** @type {import('./options.d.ts').SceneFacts | null} */
     this.csplat = null;
+    /** What draws levels of detail. @type {TileEntities | null} */
+    this.tiles = null;
     this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
     this.add(images, parameters, 0);
   }
@@ -183,7 +188,7 @@ class CsplatResource extends pc.GSplatResourceBase {
   /** @param {Parameters<typeof bandImagesOf>[1]} layers */
   addImages(layers) {
     if (layers.length === 0) return;
-    const { images, parameters } = bandImagesOf(this.scene.header, layers, this.device.maxTextureSize);
+    const { images, parameters } = bandImagesOf(this.header, layers, this.device.maxTextureSize);
     this.add(images, parameters, layers.length);
   }
 
@@ -203,13 +208,141 @@ class CsplatResource extends pc.GSplatResourceBase {
     matrix.data.set([a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1]);
     entity.setLocalRotation(new pc.Quat().setFromMat4(matrix));
     this.entities.add(entity);
+    this.tiles?.stand(entity);
   }
 
   destroy() {
-    this.scene.abort();
+    if (this.csplat) this.scene.abort(); // it is the whole scene
+    this.tiles?.destroy();
     this.entities.clear();
     super.destroy();
   }
+}
+
+/** Draws tiles as entities below those that stand in the scene. The engine sorts the splats of all components together. */
+class TileEntities {
+  /**
+   * @param {import('playcanvas').AppBase} app
+   * @param {SplatScene} scene
+   * @param {object} options of the resources
+   */
+  constructor(app, scene, options) {
+    this.app = app;
+    this.scene = scene;
+    this.options = options;
+    /** @type {Map<number, ShownTile>} */
+    this.shown = new Map();
+    /** @type {ShownTile[]} */
+    this.hidden = [];
+    /** @type {Set<Entity>} */
+    this.entities = new Set();
+    this.look = this.look.bind(this);
+    app.on('prerender', this.look);
+  }
+
+  /** @param {Entity} entity */
+  stand(entity) {
+    this.entities.add(entity);
+    entity.once('destroy', () => {
+      this.entities.delete(entity);
+      for (const { children } of this.shown.values()) children.delete(entity);
+    });
+    this.flush();
+  }
+
+  /**
+   * @param {number} index
+   * @param {LoadedTile} tile
+   */
+  show(index, tile) {
+    const { scene, app, options } = this;
+    const record = { ...allTiles(scene.file)[index], index: 0, first: 0 };
+    const header = { ...scene.file, tiles: [record], splatCount: tile.count };
+    const { graphicsDevice: device } = app;
+    const resource = new CsplatResource(
+      device,
+      scene,
+      header,
+      imagesOf(header, [tile], device.maxTextureSize),
+      options,
+    );
+    this.shown.set(index, { tile, resource, children: new Map() });
+    this.band(index);
+  }
+
+  /** @param {number} index a tile to which a band was added: they are drawn when all of them are here */
+  band(index) {
+    const one = this.shown.get(index);
+    if (!one || one.resource.gsplatData.shBands > 0) return; // they were added
+    const { tile, resource, children } = one;
+    const { degree } = this.scene;
+    const has = (/** @type {number} */ layer) => resource.header.tiles[0].layers.some((place) => place.layer === layer);
+    const layers = Array.from({ length: degree }, (_, i) => tile.sh[i]);
+    if (layers.every((sh) => !sh) || layers.some((sh, i) => !sh && has(i + 1))) return;
+    resource.addImages(layers.map((sh) => [sh]));
+    for (const { gsplat } of children.values()) if (gsplat) gsplat.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
+  }
+
+  /** @param {number} index */
+  hide(index) {
+    const one = this.shown.get(index);
+    if (one) this.hidden.push(one);
+    this.shown.delete(index);
+  }
+
+  flush() {
+    for (const { children, resource } of this.hidden.splice(0)) {
+      for (const child of children.values()) child.destroy();
+      resource.destroy();
+    }
+    for (const { children, resource } of this.shown.values()) {
+      for (const entity of this.entities) {
+        if (!children.has(entity)) children.set(entity, childOf(entity, resource));
+      }
+    }
+  }
+
+  look() {
+    const [entity] = this.entities;
+    const [camera] = this.app.systems.camera.cameras;
+    if (!entity || !camera) return;
+    const { width, height } = this.app.graphicsDevice;
+    const modelView = new pc.Mat4().mul2(camera.viewMatrix, entity.getWorldTransform());
+    const picture = { width: width * camera.rect.z, height: height * camera.rect.w, near: camera.nearClip };
+    this.scene.look(modelView.data, camera.projectionMatrix.data, picture);
+  }
+
+  destroy() {
+    this.app.off('prerender', this.look);
+    for (const index of [...this.shown.keys()]) this.hide(index);
+    this.flush();
+  }
+}
+
+/**
+ * Return an entity that draws a resource where another one stands.
+ *
+ * @param {Entity} parent
+ * @param {CsplatResource} resource
+ */
+function childOf(parent, resource) {
+  const child = new pc.Entity();
+  child.addComponent('gsplat', { resource, ...(parent.gsplat && { layers: parent.gsplat.layers }) });
+  parent.addChild(child);
+  return child;
+}
+
+/**
+ * Return a scene of one splat that is invisible, which an asset holds while its levels of detail are entities.
+ *
+ * @param {SplatScene} scene
+ */
+function blankOf({ file }) {
+  const columns = (/** @type {number} */ n) => ({ columns: new Uint8Array(n), offsets: new Array(n).fill(0), step: 1 });
+  const three = columns(3);
+  const tile = { count: 1, opacities: columns(1), scales: three, quats: three, means: three, sh0: three, sh: [] };
+  const tiles = file.tiles.slice(0, 1).map((one) => ({ ...one, index: 0, first: 0, splatCount: 1, extent: [0, 0, 0] }));
+  return { header: { ...file, tiles, splatCount: 1 }, tiles: [tile] };
 }
 
 /** @param {Image['texels']} texels */
@@ -272,19 +405,38 @@ export class CsplatParser {
     };
     const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;
+    const prepareCenters = world?.gsplatCentersEnabled !== false;
+    if (scene.levels) return this.streamed(scene, { prepareCenters });
     /** @type {import('../decoder.d.ts').PackedTile[]} */
     const tiles = [];
     for await (const tile of scene.tiles()) tiles[tile.index] = tile;
     if (header.antialiased && !world?.gsplat?.antiAlias) {
       onceSaid(NAME, 'trained with opacity compensation: set app.scene.gsplat.antiAlias = true');
     }
-    const prepareCenters = world?.gsplatCentersEnabled !== false;
-    const resource = new CsplatResource(device, scene, imagesOf(header, tiles, device.maxTextureSize), {
-      prepareCenters,
-    });
+    const images = imagesOf(header, tiles, device.maxTextureSize);
+    const resource = new CsplatResource(device, scene, header, images, { prepareCenters });
     const degree = scene.progressive ? 0 : scene.degree;
     resource.addImages(Array.from({ length: degree }, (_, i) => tiles.map(({ sh }) => sh[i])));
     resource.csplat = scene.facts(() => resource.addBands(), undefined);
+    return resource;
+  }
+
+  /**
+   * @param {SplatScene} scene
+   * @param {object} options
+   */
+  async streamed(scene, options) {
+    const { graphicsDevice: device } = this.app;
+    const tiles = new TileEntities(this.app, scene, options);
+    await scene.drawLevels(tiles).catch((error) => {
+      tiles.destroy();
+      throw error;
+    });
+    const blank = blankOf(scene);
+    const images = imagesOf(blank.header, blank.tiles, device.maxTextureSize);
+    const resource = new CsplatResource(device, scene, blank.header, images, options);
+    resource.tiles = tiles;
+    resource.csplat = scene.facts(async () => {}, undefined);
     return resource;
   }
 }

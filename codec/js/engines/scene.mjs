@@ -2,6 +2,8 @@
 // A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';
+import { LevelScene } from '../levels/level_scene.mjs';
+import { poolSize } from '../levels/splat_pool.mjs';
 import { drawnOtherwise } from '../registry.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
@@ -36,8 +38,10 @@ export async function openScene(from, options, target, signals = []) {
   const {
     shDegree,
     progressive,
-    workers,
+    workers = WORKERS,
     maxSplats = target.maxSplats ?? usualMaxSplats(),
+    levels = false,
+    pixelError = 1,
     signal: given,
     ...others
   } = options;
@@ -50,25 +54,27 @@ export async function openScene(from, options, target, signals = []) {
       life.onBytes();
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
-    const { metadata } = await reader.describe({ signal });
-    const version = await chooseTiles(reader, maxSplats);
-    const { extras, shDegree: most } = reader.header;
+    const described = reader.describe({ signal });
+    described.catch(() => {}); // it is waited for below
+    const { extras, shDegree: most, coarseTiles } = reader.header;
     const wanted = Math.min(shDegree ?? most, most);
     const degree = Math.min(wanted, target.shDegree);
+    let streamed = null;
+    if (levels && coarseTiles.length > 0) {
+      reader.retries = others.retries ?? Infinity; // what is drawn stays usable meanwhile
+      const aims = { budget: maxSplats, pixels: pixelError, around: true };
+      streamed = await LevelScene.open(/** @type {any} */ (reader), aims, signal, { shDegree: degree, workers });
+    }
+    const { metadata } = await described; // it comes together with the coarsest version
+    const version = streamed ? [] : await chooseTiles(reader, maxSplats);
     if (degree < wanted)
       onceSaid(target.name, `SH bands above ${degree} are left out: the engine ends at degree ${degree}`);
     const otherwise = drawnOtherwise(reader.header);
     if (otherwise) onceSaid(target.name, otherwise);
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
-    return new SplatScene(
-      reader,
-      version,
-      metadata,
-      { degree, progressive: progressive === true && degree > 0, workers },
-      target,
-      life,
-    );
+    const settings = { degree, progressive: progressive === true && degree > 0 && !streamed, workers };
+    return new SplatScene(reader, version, metadata, settings, target, life, streamed);
   } catch (error) {
     life.end();
     throw error;
@@ -121,11 +127,12 @@ export class SplatScene {
    * @param {CsplatReader} reader
    * @param {TileRecord[]} version its tiles
    * @param {Record<string, unknown> | null} metadata
-   * @param {{degree: number, progressive: boolean, workers?: number}} wanted
+   * @param {{degree: number, progressive: boolean, workers: number}} wanted
    * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
    * @param {Life} life
+   * @param {LevelScene | null} [levels]
    */
-  constructor(reader, version, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
+  constructor(reader, version, metadata, { degree, progressive, workers }, { engine, mirrors }, life, levels = null) {
     /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
     /** The header of the file. */
@@ -138,8 +145,8 @@ export class SplatScene {
       splatCount += tile.splatCount;
       return { ...tile, index, first };
     });
-    /** The header of a file with this version alone. */
-    this.header = { ...reader.header, tiles, splatCount };
+    /** The header of a file with this version alone, or with room for what is streamed. */
+    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels) : splatCount };
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;
@@ -147,12 +154,87 @@ export class SplatScene {
     this.life = life;
     /** @type {number[][]} sampled centres */
     this.sample = [];
+    /** What streams the levels of detail, if they are drawn by what the camera sees. */
+    this.levels = levels;
+    this.isShown = false;
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
     const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
     /** True if the tiles are mirrored, −x for x, because the engine can only rotate them. */
     this.mirrored = determinant < 0 && !mirrors;
     /** 3 × 3, by rows: makes the scene upright. */
     this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
+  }
+
+  /**
+   * Draw the levels of detail; resolves when the whole scene is drawn, at any level.
+   *
+   * @param {import('../levels/level_scene.mjs').TileTarget} target
+   */
+  async drawLevels(target) {
+    const levels = /** @type {LevelScene} */ (this.levels);
+    this.life.signal.throwIfAborted();
+    this.life.signal.addEventListener('abort', () => this.release());
+    levels.start(target, {
+      geometry: (tile) => {
+        if (!this.isShown) this.sample.push(...centresOf(tile));
+        return this.geometry(tile);
+      },
+      band: (band, layer) => this.band(band, layer),
+    });
+    try {
+      await Promise.race([levels.firstPicture, levels.stream.failed]);
+    } catch (error) {
+      this.release();
+      throw error;
+    }
+  }
+
+  /**
+   * Load and draw what a camera requires.
+   *
+   * @param {ArrayLike<number>} modelView 4 × 4, by columns: from the object's coordinates to those of the camera, whose z
+   *   points backward
+   * @param {ArrayLike<number>} projection 4 × 4, by columns
+   * @param {{width: number, height: number, near: number}} picture its size in pixels; distance of the near plane
+   */
+  look(modelView, projection, { width, height, near }) {
+    const scale = Math.hypot(modelView[0], modelView[1], modelView[2]) || 1;
+    const signs = [1, -1, -1, this.mirrored ? -1 : 1];
+    const viewmat = Array.from({ length: 16 }, (_, at) => {
+      const [row, column] = [at >> 2, at & 3];
+      if (row === 3) return column === 3 ? 1 : 0;
+      return (modelView[4 * column + row] * signs[row] * (column === 0 ? signs[3] : 1)) / scale;
+    });
+    const [fx, fy] = [0.5 * width * projection[0], 0.5 * height * projection[5]];
+    const [cx, cy] = [0.5 * width * (1 - projection[8]), 0.5 * height * (1 + projection[9])];
+    this.levels?.update({ viewmat, fx, fy, cx, cy, near: near / scale, width, height });
+  }
+
+  /** @template {import('../decoder.d.ts').PackedGeometry} T @param {T} tile @returns {T} as the engine draws it */
+  geometry(tile) {
+    return this.mirrored ? mirroredGeometry(tile) : tile;
+  }
+
+  /** @template {Packed | null} T @param {T} band @param {number} layer @returns {T} as the engine draws it */
+  band(band, layer) {
+    return this.mirrored && band ? /** @type {T} */ (mirroredBand(band, layer)) : band;
+  }
+
+  /**
+   * Return two corners of the box of all centres, not turned.
+   *
+   * @template T
+   * @param {new (x: number, y: number, z: number) => T} Vector of the engine
+   * @param {Header} [header] with the tiles; all levels if it is missing
+   * @returns {[T, T]}
+   */
+  corners(Vector, header) {
+    const all = header?.tiles ?? allTiles(this.file);
+    const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
+      [0, 1, 2].map((axis) => Math[side](...all.map((tile) => tile[side][axis]))),
+    );
+    if (this.mirrored) [low[0], high[0]] = [-high[0], -low[0]];
+    return [new Vector(low[0], low[1], low[2]), new Vector(high[0], high[1], high[2])];
   }
 
   /** Abort the load. */
@@ -185,13 +267,8 @@ export class SplatScene {
         const tile = { ...read, index: /** @type {number} */ (numbers.get(read.index)) };
         const { first } = header.tiles[tile.index];
         this.sample.push(...centresOf(tile));
-        if (!this.mirrored) yield { ...tile, first };
-        else {
-          const sh = tile.sh.map(
-            (/** @type {Packed | null} */ band, /** @type {number} */ i) => band && mirroredBand(band, i + 1),
-          );
-          yield { ...mirroredGeometry(tile), sh, first };
-        }
+        const sh = tile.sh.map((/** @type {Packed | null} */ band, /** @type {number} */ i) => this.band(band, i + 1));
+        yield { ...this.geometry(tile), sh, first };
       }
       signal.throwIfAborted();
     } catch (error) {
@@ -230,7 +307,7 @@ export class SplatScene {
     for (const { index, first } of this.header.tiles) {
       const band = await reader.readLayer(this.indices[index], layer, { form: 'packed', signal });
       signal.throwIfAborted();
-      if (band) yield { index, first, count: band.count, sh: this.mirrored ? mirroredBand(band.sh, layer) : band.sh };
+      if (band) yield { index, first, count: band.count, sh: this.band(band.sh, layer) };
     }
   }
 
@@ -243,12 +320,16 @@ export class SplatScene {
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
-    const { file: header, metadata, bounds } = this;
+    const { file: header, metadata, bounds, levels } = this;
     const { splatCount } = this.header;
-    const complete = this.progressive ? work() : Promise.resolve(done);
+    this.isShown = true;
+    const whole = levels ? Promise.race([levels.complete, levels.stream.failed]) : Promise.resolve();
+    const complete = this.progressive ? work() : whole.then(() => done);
     // If the caller does not await `complete`, its errors would be lost.
-    complete.catch((error) => this.life.signal.aborted || console.error(error)).finally(() => this.release());
-    return { header, splatCount, metadata, bounds, complete };
+    complete
+      .catch((error) => this.life.signal.aborted || console.error(error))
+      .finally(() => levels === null && this.release());
+    return { header, splatCount, metadata, bounds, complete, levels };
   }
 
   /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */
@@ -280,7 +361,7 @@ export class SplatScene {
   }
 }
 
-/** @param {PackedTile} tile */
+/** @param {import('../decoder.d.ts').PackedGeometry} tile */
 function centresOf({ count, means: { columns, offsets, step } }) {
   const every = Math.ceil(count / SAMPLE);
   return Array.from({ length: Math.ceil(count / every) }, (_, i) =>

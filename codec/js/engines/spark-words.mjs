@@ -68,6 +68,17 @@ export class ExtWords {
   }
 
   /**
+   * Make splats invisible, and their SH zero.
+   *
+   * @param {number} first splat
+   * @param {number} count
+   */
+  clear(first, count) {
+    for (const array of [...this.extArrays, ...Object.values(this.extra)])
+      array.fill(0, 4 * first, 4 * (first + count));
+  }
+
+  /**
    * Add the bands of a layer, lower layers first.
    *
    * @param {number} layer

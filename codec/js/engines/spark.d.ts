@@ -6,7 +6,7 @@ import type { LoadOptions, SceneFacts, SceneSource } from './options.d.ts';
 export interface SparkOptions extends LoadOptions {
   /**
    * `packed` for PackedSplats (float16 centres; 16 bytes and 40 of SH per splat), `ext` for ExtSplats (float32 centres; 32
-   * and 64). Default: packed if float16 is off by at most one step of the file anywhere in the scene.
+   * and 64). Default: packed if float16 is off by at most one step of the file anywhere in the scene; ext with `levels`.
    */
   layout?: 'packed' | 'ext';
 }

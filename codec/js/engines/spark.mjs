@@ -2,7 +2,9 @@
 // .csplat in Spark (@sparkjsdev/spark 2.2, three.js): `scene.add(await loadCsplat('scene.csplat'))`. See spark.d.ts.
 
 import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';
+import { DataTexture, Matrix4, Vector3 } from 'three';
 
+import { SplatPool } from '../levels/splat_pool.mjs';
 import { openScene } from './scene.mjs';
 import { ExtWords, PackedWords, halvesSuffice } from './spark-words.mjs';
 import { onceSaid } from './packed_values.mjs';
@@ -24,8 +26,8 @@ const LAYERS = /** @type {const} */ ([1, 2, 3]);
 export async function loadCsplat(from, { layout, ...options } = {}) {
   const scene = await openScene(from, options, { name: NAME, engine: 'RUB', mirrors: false, shDegree: 3 });
   const { header } = scene;
-  const make = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed' ? packed : ext;
-  const { splats, words, mesh } = await make(scene);
+  const isPacked = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed';
+  const { splats, words, mesh } = await (scene.levels ? streamed : isPacked ? packed : ext)(scene);
   turn(mesh, scene.upright);
   mesh.userData.csplat = scene.facts(() => addBands(scene, splats, words, mesh), undefined);
   const dispose = mesh.dispose.bind(mesh);
@@ -71,6 +73,74 @@ async function packed(scene) {
   const { packedArray, extra, splatEncoding } = words;
   const splats = new PackedSplats({ packedArray, extra, numSplats: header.splatCount, splatEncoding });
   return { splats, words, mesh: new SplatMesh({ packedSplats: splats, splatEncoding }) }; // without this, SplatMesh uses an encoding of its own
+}
+
+/**
+ * Build ExtSplats of the tiles that the camera requires: PackedSplats would need the ranges of all values.
+ *
+ * @param {SplatScene} scene
+ */
+async function streamed(scene) {
+  const words = new ExtWords(scene.header);
+  for (const layer of LAYERS.slice(0, scene.degree)) words.addBands(layer, []);
+  const { extArrays, extra } = words;
+  const splats = new ExtSplats({ extArrays, extra: { ...extra }, numSplats: 0 }); // it adds its textures to `extra`
+  const mesh = new SplatMesh({ extSplats: splats });
+  /** @type {[number, number][]} */
+  let changed = [];
+  const pool = new SplatPool(scene.header.splatCount, {
+    put: (tile, first) => words.put(tile, first),
+    putBand: (layer, sh, first, count) => words.putBand(layer, { sh, first, count }),
+    clear: (first, count) => words.clear(first, count),
+    flush: (ranges, end) => {
+      changed.push(...ranges);
+      splats.numSplats = end;
+      mesh.needsUpdate = true;
+    },
+  });
+  const { frameUpdate } = mesh;
+  const modelView = new Matrix4();
+  mesh.frameUpdate = (frame) => {
+    const { camera, renderer, renderSize } = frame;
+    const [first, second] = splats.textures;
+    const sh = Object.values(splats.extra).flatMap((/** @type {any} */ one) => one.value ?? []);
+    for (const texture of changed.length ? [first, second, ...sh] : []) upload(renderer, texture, changed);
+    changed = [];
+    modelView.multiplyMatrices(camera.matrixWorldInverse, mesh.matrixWorld);
+    const picture = { width: renderSize.x, height: renderSize.y, near: camera.near };
+    scene.look(modelView.elements, camera.projectionMatrix.elements, picture);
+    frameUpdate?.(frame);
+  };
+  await scene.drawLevels(pool);
+  return { splats, words, mesh };
+}
+
+/**
+ * Upload rows of an array texture. Spark itself uploads textures whole.
+ *
+ * @param {import('three').WebGLRenderer} renderer
+ * @param {import('three').DataArrayTexture} texture
+ * @param {[number, number][]} changed ranges of texels
+ */
+function upload(renderer, texture, changed) {
+  const { width, height, data } = texture.image;
+  const words = new Uint32Array(data.buffer);
+  const rows = new Set(
+    changed.flatMap(([first, count]) => {
+      const start = Math.floor(first / width);
+      return Array.from({ length: Math.ceil((first + count) / width) - start }, (_, i) => start + i);
+    }),
+  );
+  const sorted = [...rows].sort((a, b) => a - b);
+  while (sorted.length > 0) {
+    const start = sorted[0];
+    let count = 1;
+    while (sorted[count] === start + count && (start + count) % height !== 0) count++;
+    sorted.splice(0, count);
+    const some = words.subarray(4 * width * start, 4 * width * (start + count));
+    const source = new DataTexture(some, width, count, texture.format, texture.type);
+    renderer.copyTextureToTexture(source, texture, null, new Vector3(0, start % height, Math.floor(start / height)));
+  }
 }
 
 /**

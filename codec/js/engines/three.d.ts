@@ -2,6 +2,7 @@
 // Types of the loader for three.js.
 
 import type { BufferGeometry, Loader, LoadingManager, Matrix4 } from 'three';
+import type { GaussianSplat } from 'three/addons/objects/GaussianSplat.js';
 import type { LoadOptions, SceneFacts } from './options.d.ts';
 
 export type { LoadOptions };
@@ -10,7 +11,11 @@ export type SplatGeometry = BufferGeometry & {
   userData: {
     /** `complete` resolves to the geometry with SH: the same one, or after a progressive load another one, for a new
      * GaussianSplat. `upright` makes the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. */
-    csplat: SceneFacts<SplatGeometry> & { upright: Matrix4 };
+    csplat: SceneFacts<SplatGeometry> & {
+      upright: Matrix4;
+      /** With the option `levels`: from now on, draw in this object what the camera of each frame requires. */
+      refine(splats: GaussianSplat): void;
+    };
   };
 };
 

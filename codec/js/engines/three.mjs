@@ -4,9 +4,11 @@
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');
 //   const splats = new GaussianSplat(geometry); // from three/addons/objects/GaussianSplat.js
 //   splats.applyMatrix4(geometry.userData.csplat.upright);
+//   geometry.userData.csplat.refine(splats); // with the option `levels`
 
-import { BufferAttribute, BufferGeometry, Loader, Matrix4 } from 'three';
+import { Box3, BufferAttribute, BufferGeometry, Loader, Matrix4, Sphere, Vector2, Vector3 } from 'three';
 
+import { SplatPool } from '../levels/splat_pool.mjs';
 import { openScene } from './scene.mjs';
 import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './packed_values.mjs';
 
@@ -15,6 +17,8 @@ import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovar
  * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
  * @typedef {import('./options.d.ts').SceneSource} SceneSource
  * @typedef {import('./scene.mjs').SplatScene} SplatScene
+ * @typedef {import('three/addons/objects/GaussianSplat.js').GaussianSplat} GaussianSplat
+ * @typedef {import('three/addons/objects/GaussianSplat.js').StorageAttribute} StorageAttribute
  */
 
 const NAME = 'CSPLATLoader';
@@ -110,28 +114,126 @@ async function geometryOf(scene) {
   const centreAt = places(centres, 3, 0);
   const [red, green, blue, alphaAt] = places(colours, 4, 0, 4);
   const alpha = alphaOf(header);
-  for await (const tile of scene.tiles()) {
-    const { first } = tile;
+  const put = (/** @type {import('../levels/level_scene.mjs').LoadedTile} */ tile, /** @type {number} */ first) => {
     putColumns(tile.means, centreAt, first, (value) => value);
     putCovariances(tile, header, covariances, first);
     putBand(tile.sh0, [red, green, blue], first, (value) => 255 * displayColour(value));
     putColumns(tile.opacities, [alphaAt], first, (q) => 255 * alpha(q));
-    for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
-  }
-  if (!antialiased)
-    onceSaid(NAME, 'three.js draws all scenes as antialiased; small splats of this scene appear too faint');
+  };
   const geometry = new BufferGeometry();
   geometry.setAttribute('position', new BufferAttribute(centres, 3));
   geometry.setAttribute('covariance', new BufferAttribute(covariances, 6));
   geometry.setAttribute('color', new BufferAttribute(colours, 4, true));
+  let drawing = null;
+  if (scene.levels) {
+    drawing = new Drawing(scene, geometry);
+    const clear = (/** @type {number} */ first, /** @type {number} */ n) => {
+      covariances.fill(0, 6 * first, 6 * (first + n));
+      colours.fill(0, 4 * first, 4 * (first + n));
+      bands.clear(first, n);
+    };
+    const putOne = bands.put.bind(bands);
+    const flush = drawing.flush.bind(drawing);
+    await scene.drawLevels(new SplatPool(count, { put, putBand: putOne, clear, flush }));
+    geometry.boundingBox = new Box3(...scene.corners(Vector3));
+    geometry.boundingSphere = geometry.boundingBox.getBoundingSphere(new Sphere());
+  }
+  for await (const tile of scene.tiles()) {
+    put(tile, tile.first);
+    for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, tile.first);
+  }
+  if (!antialiased)
+    onceSaid(NAME, 'three.js draws all scenes as antialiased; small splats of this scene appear too faint');
   bands.addTo(geometry);
-  geometry.computeBoundingBox();
-  geometry.computeBoundingSphere();
+  if (!geometry.boundingBox) {
+    geometry.computeBoundingBox();
+    geometry.computeBoundingSphere();
+  }
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
-  geometry.userData = { csplat: { ...facts, upright } };
+  const refine = (/** @type {GaussianSplat} */ splats) => drawing?.start(splats);
+  geometry.userData = { csplat: { ...facts, upright, refine } };
   geometry.addEventListener('dispose', () => scene.abort());
   return geometry;
+}
+
+/** What a GaussianSplat draws of a pool. It reads its geometry only on construction, so its buffers are changed. */
+class Drawing {
+  /**
+   * @param {SplatScene} scene
+   * @param {BufferGeometry} geometry
+   */
+  constructor(scene, geometry) {
+    this.scene = scene;
+    this.geometry = geometry;
+    /** @type {[number, number][]} */
+    this.changed = [];
+    this.modelView = new Matrix4();
+  }
+
+  /** @param {[number, number][]} ranges */
+  flush(ranges) {
+    this.changed.push(...ranges);
+  }
+
+  /** @param {GaussianSplat} splats */
+  start(splats) {
+    splats.boundingSphere = this.geometry.boundingSphere;
+    const { onBeforeRender: own } = splats;
+    splats.onBeforeRender = (renderer, scene, camera) => {
+      this.modelView.multiplyMatrices(camera.matrixWorldInverse, splats.matrixWorld);
+      const { x: width, y: height } = renderer.getDrawingBufferSize(new Vector2());
+      this.scene.look(this.modelView.elements, camera.projectionMatrix.elements, { width, height, near: camera.near });
+      if (this.changed.length > 0) this.copy(splats);
+      own(renderer, scene, camera);
+    };
+  }
+
+  /** @param {GaussianSplat} splats */
+  copy(splats) {
+    const { attributes } = this.geometry;
+    const { _buffers: buffers } = splats;
+    const [centres, covariances] = [attributes.position.array, attributes.covariance.array];
+    const colours = new Uint32Array(attributes.color.array.buffer);
+    const [centre, a, b] = [buffers.centerRead, buffers.covarianceARead, buffers.covarianceBRead].map(
+      ({ value }) => value.array,
+    );
+    for (const [first, count] of this.changed) {
+      for (let i = first; i < first + count; i++) {
+        for (let k = 0; k < 3; k++) centre[4 * i + k] = centres[3 * i + k];
+        for (let k = 0; k < 4; k++) a[4 * i + k] = covariances[6 * i + k];
+        b[4 * i] = covariances[6 * i + 4];
+        b[4 * i + 1] = covariances[6 * i + 5];
+      }
+    }
+    this.upload(buffers.centerRead.value, 4, null);
+    this.upload(buffers.covarianceARead.value, 4, null);
+    this.upload(buffers.covarianceBRead.value, 4, null);
+    this.upload(buffers.colorRead.value, 1, colours);
+    for (let degree = 1; degree <= buffers.sphericalHarmonicsDegree; degree++) {
+      const words = attributes[`sphericalHarmonics${degree}`].array;
+      this.upload(buffers[`sphericalHarmonics${degree}Attribute`], SH_WORDS[degree], words);
+    }
+    this.changed = [];
+    splats._sortInitialized = splats._sphericalHarmonicsInitialized = false; // both are computed anew
+  }
+
+  /**
+   * @param {StorageAttribute} attribute
+   * @param {number} width words per splat
+   * @param {ArrayLike<number> | null} words copied to it, unless it has them already
+   */
+  upload(attribute, width, words) {
+    for (const [first, count] of this.changed) {
+      const [start, size] = [width * first, width * count];
+      if (words && words !== attribute.array) {
+        for (let i = start; i < start + size; i++) attribute.array[i] = words[i];
+      }
+      attribute.addUpdateRange(start, size);
+    }
+    attribute.needsUpdate = true;
+    if (attribute.pbo) attribute.pbo.needsUpdate = true; // the texture that WebGL reads
+  }
 }
 
 /**
@@ -174,6 +276,16 @@ class Bands {
    */
   put(layer, band, first) {
     putBand(band, this.places[layer - 1], first, (value) => 128 * value + 128);
+  }
+
+  /**
+   * @param {number} first splat
+   * @param {number} count
+   */
+  clear(first, count) {
+    for (const [i, words] of this.words.entries()) {
+      words.fill(SH_ZERO, SH_WORDS[i + 1] * first, SH_WORDS[i + 1] * (first + count));
+    }
   }
 
   /** @param {BufferGeometry} geometry */

@@ -4,19 +4,51 @@
 declare module 'three' {
   export class BufferAttribute {
     constructor(array: ArrayBufferView, itemSize: number, normalized?: boolean);
+    array: any;
   }
+  export class Box3 {
+    constructor(min: Vector3, max: Vector3);
+    getBoundingSphere(target: Sphere): Sphere;
+  }
+  export class Sphere {}
   export class BufferGeometry {
     userData: object;
     attributes: Record<string, BufferAttribute>;
-    boundingBox: object | null;
-    boundingSphere: object | null;
+    boundingBox: Box3 | null;
+    boundingSphere: Sphere | null;
     addEventListener(type: string, listener: () => void): void;
     setAttribute(name: string, attribute: BufferAttribute): this;
     computeBoundingBox(): void;
     computeBoundingSphere(): void;
   }
   export class Matrix4 {
+    elements: number[];
     set(...rows: number[]): this;
+    multiplyMatrices(a: Matrix4, b: Matrix4): this;
+  }
+  export class Vector2 {
+    x: number;
+    y: number;
+  }
+  export class Vector3 {
+    constructor(...coordinates: number[]);
+  }
+  export class PerspectiveCamera {
+    near: number;
+    matrixWorldInverse: Matrix4;
+    projectionMatrix: Matrix4;
+  }
+  export class DataTexture {
+    constructor(data: ArrayBufferView, width: number, height: number, format: number, type: number);
+  }
+  export class DataArrayTexture {
+    image: { width: number; height: number; depth: number; data: ArrayBufferView };
+    format: number;
+    type: number;
+    isDataArrayTexture: boolean;
+  }
+  export class WebGLRenderer {
+    copyTextureToTexture(from: DataTexture, to: DataArrayTexture, region: null, position: Vector3): void;
   }
   export class LoadingManager {
     abortController?: AbortController;
@@ -35,6 +67,28 @@ declare module 'three' {
   }
 }
 
+declare module 'three/addons/objects/GaussianSplat.js' {
+  import type { Matrix4, PerspectiveCamera, Sphere, Vector2 } from 'three';
+  export interface StorageAttribute {
+    array: any;
+    needsUpdate: boolean;
+    pbo?: { needsUpdate: boolean };
+    addUpdateRange(start: number, count: number): void;
+  }
+  export class GaussianSplat {
+    boundingSphere: Sphere | null;
+    matrixWorld: Matrix4;
+    onBeforeRender: (
+      renderer: { getDrawingBufferSize(target: Vector2): Vector2 },
+      scene: unknown,
+      camera: PerspectiveCamera,
+    ) => void;
+    _buffers: any;
+    _sortInitialized: boolean;
+    _sphericalHarmonicsInitialized: boolean;
+  }
+}
+
 declare module '@babylonjs/core/Misc/fileRequest.js' {
   import type { Observable } from '@babylonjs/core/Misc/observable.js';
   export interface IFileRequest {
@@ -45,18 +99,26 @@ declare module '@babylonjs/core/Misc/fileRequest.js' {
 
 declare module '@babylonjs/core/Misc/observable.js' {
   export class Observable<T> {
+    add(listener: () => void): { remove(): void };
     addOnce(listener: () => void): { remove(): void };
     notifyObservers(value: T): void;
   }
 }
 
 declare module '@babylonjs/core/scene.js' {
+  import type { Matrix } from '@babylonjs/core/Maths/math.vector.js';
   import type { Observable } from '@babylonjs/core/Misc/observable.js';
   export class Scene {
     isDisposed: boolean;
     onDisposeObservable: Observable<Scene>;
+    onBeforeRenderObservable: Observable<Scene>;
     useRightHandedSystem: boolean;
-    getEngine(): { getCaps(): { maxTextureSize: number } };
+    activeCamera: { minZ: number; getViewMatrix(): Matrix; getProjectionMatrix(): Matrix } | null;
+    getEngine(): {
+      getCaps(): { maxTextureSize: number };
+      getRenderWidth(): number;
+      getRenderHeight(): number;
+    };
   }
 }
 
@@ -73,16 +135,20 @@ declare module '@babylonjs/core/Loading/sceneLoader.js' {
 }
 
 declare module '@babylonjs/core/Maths/math.vector.js' {
-  export class Vector3 {}
+  export class Vector3 {
+    constructor(x: number, y: number, z: number);
+  }
   export class Quaternion {}
   export class Matrix {
+    multiply(other: Matrix): Matrix;
+    asArray(): ArrayLike<number>;
     static FromValues(...values: number[]): Matrix;
     decompose(scaling: Vector3, rotation: Quaternion): boolean;
   }
 }
 
 declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js' {
-  import type { Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
+  import type { Matrix, Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.js';
   import type { Scene } from '@babylonjs/core/scene.js';
   export class GaussianSplattingMesh {
     constructor(name: string, url: string | null, scene: Scene, keepInRam?: boolean);
@@ -92,14 +158,23 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
     rotationQuaternion: Quaternion | null;
     scaling: Vector3;
     computeWorldMatrix(force: boolean): void;
+    getWorldMatrix(): Matrix;
+    getBoundingInfo(): { reConstruct(min: Vector3, max: Vector3, world: Matrix): void };
+    setSplatIndexRanges(ranges: { offset: number; count: number }[]): void;
+    _writeStreamingSplats(first: number, count: number, rows: Uint8Array): void;
+    _updateShTextureData(texture: object, data: Uint8Array, width: number, line: number, lines: number): void;
+    _shTextures: object[];
     dispose(doNotRecurse?: boolean, disposeMaterialAndTextures?: boolean): void;
     updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
   }
 }
 
 declare module '@sparkjsdev/spark' {
+  import type { DataArrayTexture, Matrix4, PerspectiveCamera, Vector2, WebGLRenderer } from 'three';
   export class ExtSplats {
     extra: Record<string, unknown>;
+    numSplats: number;
+    textures: [DataArrayTexture, DataArrayTexture];
     constructor(options: { extArrays: [Uint32Array, Uint32Array]; extra: Record<string, unknown>; numSplats: number });
   }
   export class PackedSplats {
@@ -118,6 +193,9 @@ declare module '@sparkjsdev/spark' {
       splatEncoding?: Record<string, number>;
     });
     matrix: { set(...rows: number[]): unknown };
+    matrixWorld: Matrix4;
+    set needsUpdate(value: boolean);
+    frameUpdate?: (frame: { renderer: WebGLRenderer; camera: PerspectiveCamera; renderSize: Vector2 }) => void;
     quaternion: { setFromRotationMatrix(matrix: unknown): unknown };
     userData: Record<string, unknown>;
     dispose(): void;
@@ -136,11 +214,25 @@ declare module 'playcanvas' {
     fire(name: string, ...values: unknown[]): unknown;
   }
   export interface AppBase {
-    graphicsDevice: { maxTextureSize: number };
+    graphicsDevice: { maxTextureSize: number; width: number; height: number };
+    systems: { camera: { cameras: CameraComponent[] } };
+    on(name: string, listener: () => void): void;
+    off(name: string, listener: () => void): void;
     scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean; splatBudget: number } };
   }
+  export interface CameraComponent {
+    viewMatrix: Mat4;
+    projectionMatrix: Mat4;
+    rect: { z: number; w: number };
+    nearClip: number;
+  }
   export class Entity {
-    gsplat?: { workBufferUpdate: number };
+    gsplat?: { workBufferUpdate: number; layers: number[] };
+    addComponent(name: string, data: object): void;
+    addChild(child: Entity): void;
+    getWorldTransform(): Mat4;
+    once(name: string, listener: () => void): void;
+    destroy(): void;
     setLocalRotation(rotation: Quat): void;
   }
   export class Vec3 {
@@ -149,6 +241,7 @@ declare module 'playcanvas' {
   }
   export class Mat4 {
     data: Float32Array;
+    mul2(a: Mat4, b: Mat4): this;
   }
   export class Quat {
     setFromMat4(matrix: Mat4): this;

@@ -27,7 +27,7 @@ PAGE = "tools/viewer/index.html"
 ELEMENT = "tools/viewer/element.mjs"
 WORKER = "tools/viewer/worker.mjs"
 
-_FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",)}
+_FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",), "codec/js/levels": (".mjs",)}
 
 
 def web_files() -> dict[str, Path]:

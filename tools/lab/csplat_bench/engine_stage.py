@@ -49,7 +49,7 @@ _IMPORTS = {
     "@playcanvas/supersplat-viewer/": "@playcanvas/supersplat-viewer/dist/",
 }  # fmt: skip
 # Spark needs three's WebGLRenderer; three's own splats need its WebGPURenderer.
-_CLASSIC = ("/node_modules/@sparkjsdev/", "/pages/spark.mjs")
+_CLASSIC = ("/node_modules/@sparkjsdev/", "/pages/spark.mjs", "/codec/js/engines/spark.mjs")
 _PAGE = """<!doctype html><link rel="icon" href="data:,"><body style="margin:0;background:#000">
 <canvas style="display:block"></canvas><script type="importmap">{"imports":%s,"scopes":%s}</script>"""
 

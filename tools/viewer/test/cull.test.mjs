@@ -3,7 +3,8 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { ALPHA_MIN, DILATION, slopeLimits, toCamera, viewOf } from '../camera_maths.mjs';
+import { slopeLimits } from '../../../codec/js/levels/level_cut.mjs';
+import { ALPHA_MIN, DILATION, toCamera, viewOf } from '../camera_maths.mjs';
 import { cull, reachClass } from '../cull.mjs';
 import { random } from './random.mjs';
 

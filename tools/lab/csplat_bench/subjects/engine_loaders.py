@@ -79,6 +79,15 @@ class Trial:
         report: dict[str, Any] = self.page.evaluate("(words) => trial.show(...words)", words)
         return report
 
+    def look(self, camera: dict[str, Any]) -> None:
+        """Move the camera."""
+        self.page.evaluate("(camera) => trial.look(camera)", camera)
+
+    def levels(self) -> dict[str, Any]:
+        """Return the number of splats drawn of a file with levels, and whether all that the camera requires is here."""
+        state: dict[str, Any] = self.page.evaluate("trial.levels()")
+        return state
+
     def remove(self) -> None:
         """Remove the scene."""
         self.page.evaluate("trial.remove()")

@@ -35,9 +35,10 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
       const world = splats.computeWorldMatrix(true);
       if (camera) look(eye, camera, world);
       const remove = () => splats.dispose(false, true);
-      const whole = splats.metadata?.csplat?.complete;
-      return { world: Array.from(world.asArray()), count: splats.splatCount, whole, remove };
+      const { complete: whole, levels } = splats.metadata?.csplat ?? {};
+      return { world: Array.from(world.asArray()), count: splats.splatCount, whole, levels, remove };
     },
+    look: (camera, world) => look(eye, camera, Matrix.FromArray(world)),
     close: () => engine.dispose(),
   };
 }

@@ -41,8 +41,9 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
         asset.unload();
       };
       const { csplat, numSplats: count } = asset.resource;
-      return { world: Array.from(world.data), count, whole: csplat?.complete, remove };
+      return { world: Array.from(world.data), count, whole: csplat?.complete, levels: csplat?.levels, remove };
     },
+    look: (camera, world) => look(eye, camera, Object.assign(new pc.Mat4(), { data: Float32Array.from(world) })),
     close: () => app.destroy(),
   };
 }

@@ -30,8 +30,10 @@ export async function start(canvas, { width, height }) {
         splats.dispose();
       };
       const { matrixWorld, userData } = splats;
-      return { world: matrixWorld.toArray(), count: splats.splats.getNumSplats(), whole: userData.csplat?.complete, remove };
+      const { complete: whole, levels } = userData.csplat ?? {};
+      return { world: matrixWorld.toArray(), count: splats.splats.getNumSplats(), whole, levels, remove };
     },
+    look: (camera, world) => look(eye, camera, new THREE.Matrix4().fromArray(world)),
     close: () => {
       renderer.setAnimationLoop(null);
       spark.dispose?.();

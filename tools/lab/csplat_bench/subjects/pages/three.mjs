@@ -34,14 +34,17 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
       splats.traverse((one) => { inner = one.isGaussianSplat ? one : inner; });
       const { matrixWorld, splatGeometry } = inner;
       if (camera) look(eye, camera, matrixWorld);
-      const whole = splatGeometry.userData.csplat?.complete.then((geometry) => {
+      const { complete, levels, refine } = splatGeometry.userData.csplat ?? {};
+      refine?.(inner);
+      const whole = complete?.then((geometry) => {
         if (geometry === splatGeometry) return;
         take(scene, splats);
         scene.add((splats = standing(geometry)));
       });
       const remove = () => take(scene, splats);
-      return { world: matrixWorld.toArray(), count: splatGeometry.getAttribute('position').count, whole, remove };
+      return { world: matrixWorld.toArray(), count: splatGeometry.getAttribute('position').count, whole, levels, remove };
     },
+    look: (camera, world) => look(eye, camera, new THREE.Matrix4().fromArray(world)),
     close: () => {
       renderer.setAnimationLoop(null);
       renderer.dispose();

@@ -85,6 +85,15 @@ export async function show(url, camera, { abortAt, ...options } = {}) {
 /** Some engines wrap a loader's error. */
 const cause = (error) => (error.innerError ? cause(error.innerError) : error);
 
+/** Moves the camera. */
+export const look = (camera) => stage.look(camera, shown.world);
+
+/** What is drawn of a file with levels of detail, and whether all that the camera requires is. */
+export const levels = () => {
+  const { splatCount, isComplete } = shown.levels;
+  return { splatCount, isComplete };
+};
+
 /** Removes the scene. */
 export async function remove() {
   shown.remove();

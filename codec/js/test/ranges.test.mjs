@@ -3,8 +3,8 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { Ranges } from '../ranges.mjs';
-import { random } from './random.mjs';
+import { Ranges } from '../levels/ranges.mjs';
+import { random } from '../../../tools/viewer/test/random.mjs';
 
 test('ranges never overlap, never cross pages, and leave nothing behind', () => {
   const sizes = [100, 40, 100];

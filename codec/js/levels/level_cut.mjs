@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 // Choices in a file with levels of detail: the tiles that are drawn, of those that are here, and the tiles to request.
 
-import { slopeLimits } from './camera_maths.mjs';
-
 /**
- * @typedef {import('./types.d.ts').Header} Header
- * @typedef {import('./types.d.ts').TreeNode} TreeNode
- * @typedef {import('./types.d.ts').View} View
+ * @typedef {import('../decoder.d.ts').Header} Header
+ * @typedef {import('../decoder.d.ts').TreeNode} TreeNode
+ *
+ * A pinhole camera: world → camera row by row, a rotation and a translation, with x right, y down, z forward (OpenCV); pixels;
+ * distance along z from which on splats are drawn, scene units.
+ *
+ * @typedef {{viewmat: ArrayLike<number>, fx: number, fy: number, cx: number, cy: number, near: number, width: number,
+ *   height: number}} View
  *
  * Nodes in a view.
  *
@@ -25,6 +28,9 @@ import { slopeLimits } from './camera_maths.mjs';
  *
  * @typedef {{node: TreeNode, isNeeded: boolean, isDrawn: boolean, urgency: number, distance: number}} Wish
  */
+
+/** Maximum distance outside the picture at which the perspective is linearised, in half-widths of the picture. */
+const FOV_MARGIN = 0.3;
 
 /** Factor by which the error of a refined node counts more, so that small movements do not exchange it back and forth. */
 const INERTIA = 1.25;
@@ -53,9 +59,10 @@ export function nodesOrTiles({ tiles, coarseTiles }, nodes) {
  * @param {Looks} looks
  * @param {number} budget maximum number of splats, unless the coarsest nodes have more
  * @param {Set<number>} [before] `refined` of the preceding cut
+ * @param {number} [least] error, in pixels, up to which nodes stay as well
  * @returns {Cut} tiles ascending
  */
-export function chooseTiles(nodes, isHere, looks, budget, before = new Set()) {
+export function chooseTiles(nodes, isHere, looks, budget, before = new Set(), least = -1) {
   /** @type {boolean[]} whether a node's own tiles are all here */
   const isLoaded = [];
   /** @type {boolean[]} whether the node, or the nodes below it, cover its part of the scene */
@@ -73,7 +80,7 @@ export function chooseTiles(nodes, isHere, looks, budget, before = new Set()) {
   });
   const refined = refine(nodes, errors, budget, {
     must: (node) => node.children.length > 0 && !isLoaded[node.index],
-    may: ({ index }) => canRefine[index],
+    may: ({ index }) => canRefine[index] && errors[index] > least,
   });
   const tiles = nodes.flatMap(({ index, parent, firstTile, tileCount }) => {
     const isChosen = !refined.has(index) && (parent === null || refined.has(parent));
@@ -164,6 +171,18 @@ export function looksOf(nodes, view) {
     looks.pixels[index] = (error * Math.max(fx, fy)) / Math.max(near, looks.distance[index]);
   }
   return looks;
+}
+
+/**
+ * Return the smallest and largest x/z and y/z at which the perspective is linearised.
+ *
+ * @param {View} view
+ * @returns {[number, number, number, number]}
+ */
+export function slopeLimits({ fx, fy, cx, cy, width, height }) {
+  const marginX = (FOV_MARGIN * 0.5 * width) / fx;
+  const marginY = (FOV_MARGIN * 0.5 * height) / fy;
+  return [-cx / fx - marginX, (width - cx) / fx + marginX, -cy / fy - marginY, (height - cy) / fy + marginY];
 }
 
 /**

@@ -3,8 +3,8 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { viewOf } from '../camera_maths.mjs';
-import { chooseTiles, chooseWishes, looksOf } from '../level_cut.mjs';
+import { viewOf } from '../../../tools/viewer/camera_maths.mjs';
+import { chooseTiles, chooseWishes, looksOf } from '../levels/level_cut.mjs';
 
 /** Two leaves of two tiles and one of one tile; a parent of the first two; a root. Tiles 0 to 4 are of level 0. */
 const node = (index, level, parent, children, firstTile, tileCount, error, splatCount, min, max) => ({

@@ -8,7 +8,7 @@ import { readHeader } from '../../../codec/js/decoder.mjs';
 import { HEADER_SIZE } from '../../../codec/js/spec.mjs';
 import { coarseBounds, fineBounds, weightedQuantile } from '../bounds.mjs';
 import { viewOf } from '../camera_maths.mjs';
-import { TileStream } from '../tile_stream.mjs';
+import { TexelStream } from '../texel_stream.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 const bytes = (name) => readFileSync(new URL(`${name}.csplat`, VECTORS));
@@ -38,18 +38,18 @@ function collector() {
 }
 
 /** Resolve when everything that a view requires is here. */
-async function seen(stream, view) {
-  const done = new Promise((resolve) => (stream.sink.resolve = resolve));
-  stream.isComplete = false;
-  stream.setView(view);
-  await Promise.race([done, stream.failed]);
+async function seen({ tiles }, sink, view) {
+  const done = new Promise((resolve) => (sink.resolve = resolve));
+  tiles.isComplete = false;
+  tiles.setView(view);
+  await Promise.race([done, tiles.failed]);
 }
 
 /** Return all events of reading a file for a camera. */
 async function loaded(source, { signal = new AbortController().signal, aims = AIMS, view = viewFrom(-1e4) } = {}) {
   const sink = collector();
-  const stream = await TileStream.open(source, sink, aims, signal);
-  await seen(stream, view);
+  const stream = await TexelStream.open(source, sink, aims, signal);
+  await seen(stream, sink, view);
   return sink.events;
 }
 
@@ -194,16 +194,16 @@ test('no part is requested twice, and what is seen later is requested then', asy
   const sink = collector();
   const aims = { ...AIMS, around: false };
   const { signal } = new AbortController();
-  const stream = await TileStream.open('http://example.test/a', sink, aims, signal, options);
+  const stream = await TexelStream.open('http://example.test/a', sink, aims, signal, options);
   const parts = [];
   const { prefetch } = stream.reader;
   stream.reader.prefetch = (wanted, options) => {
     parts.push(...wanted.map(({ tile, layer }) => `${tile}.${layer}`));
     prefetch.call(stream.reader, wanted, options);
   };
-  await seen(stream, viewFrom(1e6)); // behind the camera
+  await seen(stream, sink, viewFrom(1e6)); // behind the camera
   const before = parts.length;
-  await seen(stream, viewFrom(-300));
+  await seen(stream, sink, viewFrom(-300));
   assert.ok(0 < before && before < parts.length);
   assert.equal(parts.length, new Set(parts).size);
 });
@@ -212,12 +212,13 @@ test('what is not required any more is cancelled', async () => {
   const { requests, options } = served(LEVELS);
   const aims = { ...AIMS, around: false };
   const { signal } = new AbortController();
-  const stream = await TileStream.open('http://example.test/a', collector(), aims, signal, options);
-  await seen(stream, viewFrom(1e6));
+  const sink = collector();
+  const stream = await TexelStream.open('http://example.test/a', sink, aims, signal, options);
+  await seen(stream, sink, viewFrom(1e6));
   const before = requests.length;
-  stream.setView(viewFrom(-300));
-  const inFlight = [...stream.pending.values()];
-  stream.setView(viewFrom(1e6));
+  stream.tiles.setView(viewFrom(-300));
+  const inFlight = [...stream.tiles.pending.values()];
+  stream.tiles.setView(viewFrom(1e6));
   assert.ok(before < requests.length);
   assert.ok(inFlight.length > 0);
   assert.ok(inFlight.every(({ signal }) => signal.aborted));
@@ -249,9 +250,9 @@ test('a lost connection is reported once and tried again, without end once the s
   const { options } = served(LEVELS, { fails: () => !isOnline && failures++ < 30 });
   const sink = collector();
   const { signal } = new AbortController();
-  const stream = await TileStream.open('http://example.test/a', sink, AIMS, signal, options);
+  const stream = await TexelStream.open('http://example.test/a', sink, AIMS, signal, options);
   isOnline = false;
-  await seen(stream, viewFrom(-300));
+  await seen(stream, sink, viewFrom(-300));
   assert.ok(failures >= 30);
   assert.equal(tilesIn(sink.events).length, levelOf.size);
   const warnings = sink.events.filter(({ type }) => type === 'warn');
@@ -265,11 +266,11 @@ test('the first request is tried again, too, but not without end', async () => {
   const { options, requests } = served(LEVELS, { fails: (n) => n < 3 });
   const { signal } = new AbortController();
   const sink = collector();
-  await TileStream.open('http://example.test/a', sink, AIMS, signal, { ...options, retries: 2 });
+  await TexelStream.open('http://example.test/a', sink, AIMS, signal, { ...options, retries: 2 });
   assert.ok(requests.length >= 3);
   assert.equal(sink.events.filter(({ type }) => type === 'warn').length, 1);
   const never = served(LEVELS, { fails: () => true });
-  const opening = TileStream.open('http://example.test/a', collector(), AIMS, signal, never.options);
+  const opening = TexelStream.open('http://example.test/a', collector(), AIMS, signal, never.options);
   await assert.rejects(opening, { code: 'E_INPUT', reason: 'connection' });
 });
 
@@ -284,25 +285,26 @@ test('a file that is replaced while it is read ends the reading with that', asyn
     return new Response(sent, { status: 206, headers });
   };
   const { signal } = new AbortController();
-  const stream = await TileStream.open('http://example.test/a', collector(), AIMS, signal, {
+  const sink = collector();
+  const stream = await TexelStream.open('http://example.test/a', sink, AIMS, signal, {
     ...options,
     fetch: later,
   });
   isReplaced = true;
-  await assert.rejects(seen(stream, viewFrom(-300)), { code: 'E_INPUT', isReplaced: true });
+  await assert.rejects(seen(stream, sink, viewFrom(-300)), { code: 'E_INPUT', isReplaced: true });
 });
 
 test('a hidden page reads the coarsest version alone, and goes on when it is seen', async () => {
   const sink = collector();
-  const stream = await TileStream.open(new Blob([LEVELS]), sink, AIMS, new AbortController().signal);
-  stream.pause(true);
-  stream.setView(viewFrom(-300));
+  const stream = await TexelStream.open(new Blob([LEVELS]), sink, AIMS, new AbortController().signal);
+  stream.tiles.pause(true);
+  stream.tiles.setView(viewFrom(-300));
   await until(() => tilesIn(sink.events).length > 0);
   await new Promise((resolve) => setTimeout(resolve, 20));
   const coarsest = Math.max(...levelOf.values());
   assert.ok(tilesIn(sink.events).every((tile) => levelOf.get(tile) === coarsest));
   const done = new Promise((resolve) => (sink.resolve = resolve));
-  stream.pause(false);
+  stream.tiles.pause(false);
   await done;
   assert.equal(tilesIn(sink.events).length, levelOf.size);
 });
@@ -313,9 +315,10 @@ test('of every file with levels, what a view requires arrives, whatever the view
   for (const name of names) {
     const data = bytes(`valid/${name.replace('.csplat', '')}`);
     const aims = { ...AIMS, pixels: 1 };
-    const stream = await TileStream.open(new Blob([data]), collector(), aims, new AbortController().signal);
+    const sink = collector();
+    const stream = await TexelStream.open(new Blob([data]), sink, aims, new AbortController().signal);
     for (const z of [-1e4, -300, -30, -3, 0, 50]) {
-      await seen(stream, viewFrom(z));
+      await seen(stream, sink, viewFrom(z));
       assert.ok(stream.here.size > 0);
     }
   }
