@@ -169,6 +169,7 @@ class Drawing {
     /** @type {[number, number][]} */
     this.changed = [];
     this.modelView = new Matrix4();
+    this.size = new Vector2();
   }
 
   /** @param {[number, number][]} ranges */
@@ -182,7 +183,7 @@ class Drawing {
     const { onBeforeRender: own } = splats;
     splats.onBeforeRender = (renderer, scene, camera) => {
       this.modelView.multiplyMatrices(camera.matrixWorldInverse, splats.matrixWorld);
-      const { x: width, y: height } = renderer.getDrawingBufferSize(new Vector2());
+      const { x: width, y: height } = renderer.getDrawingBufferSize(this.size);
       this.scene.look(this.modelView.elements, camera.projectionMatrix.elements, { width, height, near: camera.near });
       if (this.changed.length > 0) this.copy(splats);
       own(renderer, scene, camera);
