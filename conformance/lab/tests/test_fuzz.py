@@ -24,6 +24,12 @@ def test_the_decoders_agree_on_damaged_files(tmp_path):
     assert "0 kinds of findings" in run.stdout
 
 
+def test_damage_above_level_0_which_decode_leaves_unread_is_no_finding(tmp_path):
+    run = fuzz("--target", "decoder", "--count", "500", "--jobs", "1", "--plain", "--out", str(tmp_path))
+    assert (0, "") == (run.returncode, run.stderr)
+    assert "0 kinds of findings" in run.stdout
+
+
 def test_earlier_findings_stay_harmless(tmp_path):
     run = fuzz("--target", "ply", "--replay", str(LAB / "corpus" / "ply"), "--out", str(tmp_path))
     assert (0, "") == (run.returncode, run.stderr), run.stdout
