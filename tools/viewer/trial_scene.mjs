@@ -52,7 +52,7 @@ export async function isSound(renderer) {
   let isRight = true;
   for (const method of [renderer.tiles, renderer.quads]) {
     renderer.use(method);
-    const pixels = await renderer.pixelsOf(view, { background: BACKGROUND, shDegree: 0 });
+    const pixels = await renderer.pixelsOf(view, { background: BACKGROUND, shDegree: 0 }, 1);
     for (const [x, y] of PIXELS) {
       expectedAt(x, y).forEach((value, c) => {
         isRight &&= Math.abs(255 * value - pixels[4 * (SIZE * y + x) + c]) <= TOLERANCE;

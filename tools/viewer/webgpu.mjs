@@ -255,8 +255,9 @@ export class WebGpuRenderer {
   /**
    * @param {View} view
    * @param {Look} look
+   * @param {number} [tries] how often it is drawn until it fits the buffers, which a GPU that does not work may never report
    */
-  async pixelsOf(view, look) {
+  async pixelsOf(view, look, tries = Infinity) {
     const { device } = this;
     const { width, height } = view;
     if (device.isLost || !(width > 0 && height > 0)) return new Uint8Array(0);
@@ -265,7 +266,7 @@ export class WebGpuRenderer {
     const buffer = device.buffer(bytesPerRow * height);
     try {
       do this.#drawTo(texture, this.present, this.method, { view, look });
-      while (!(await this.#isComplete(view)));
+      while (--tries > 0 && !(await this.#isComplete(view)));
       const encoder = device.device.createCommandEncoder();
       encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, [width, height]);
       device.device.queue.submit([encoder.finish()]);
