@@ -79,9 +79,9 @@ async function start() {
   if (process?.versions?.node === undefined) {
     return new Correspondent(new Worker(new URL('./csplat-worker.mjs', import.meta.url), { type: 'module' }));
   }
-  const [name, side] = ['node:worker_threads', './csplat-worker.mjs']; // hides them from bundlers
+  const [name, side, here] = ['node:worker_threads', './csplat-worker.mjs', import.meta.url]; // hides them from bundlers
   const threads = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
-  return new Correspondent(new threads.Worker(new URL(side, import.meta.url)));
+  return new Correspondent(new threads.Worker(new URL(side, here)));
 }
 
 /**
