@@ -87,7 +87,7 @@ class DecoderSuiteOptions:
 
     @property
     def claim(self) -> str:
-        """What a decoder that passes may claim; "" if not all vectors are compared."""
+        """The claim that a decoder may print once it passes; "" if not all vectors are compared."""
         if self.pattern or self.clause or not {*PARTS} <= {*self.levels}:
             return ""
         return f"a decoder, {self.by}, resource level {self.resource_level}"

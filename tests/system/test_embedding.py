@@ -621,7 +621,7 @@ def test_the_camera_can_be_kept_restored_and_followed(tab, blog, tmp_path):
     page.evaluate("(camera) => { moves.length = 0; view.camera = camera; }", kept)
     tab.until(f"JSON.stringify(view.camera) === '{json.dumps(kept, separators=(',', ':'))}'")
     page.wait_for_timeout(150)
-    assert [] == page.evaluate("moves")  # of the user's movements alone
+    assert [] == page.evaluate("moves")  # only what the user does fires events
     with page.expect_console_message(lambda message: "The camera cannot be used" in message.text):
         page.evaluate("view.camera = { K: 1 }")
     assert kept == page.evaluate("view.camera")
