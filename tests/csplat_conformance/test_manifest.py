@@ -367,7 +367,7 @@ LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 def row():
     """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
     part = GUIDE.split("### Declaring errors")[1].split("So SERR declares")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:1] == "|"]
+    rows = [re.split(" {2,}", line) for line in part.split("```text")[1].splitlines()]
     table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
 
     def numbers(name):
@@ -424,9 +424,9 @@ def test_the_values_and_the_code_of_the_guide_give_the_declared_errors(row, sour
         for name, values in names["errors"](j, j):
             near(row(f"error of {name}")[j], values)
     part = GUIDE.split("So SERR declares")[1].split("## ")[0]
-    table = dict(re.findall(r"^\| (\w+) \| ([\d.]+ \| [\d.]+) \|", part, re.MULTILINE))
+    table = dict(re.findall(r"^(\w+) +([\d.]+ +[\d.]+)$", part, re.MULTILINE))
     for name, pair in names["declared"]([0, 1]).items():
-        near([float(number) for number in table[name].split(" | ")], pair)
+        near([float(number) for number in table[name].split()], pair)
 
 
 def test_every_must_ends_in_a_clause_id():
