@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure what the readers need for the worst inputs that we know: bytes of memory and microseconds of CPU per byte.
 
-    python tools/lab/budgets.py              # a table in Markdown, as in SECURITY.md
+    python tools/lab/budgets.py              # a table in Markdown
     python tools/lab/budgets.py ply sog      # the inputs whose names contain one of these
 
 Each input has about two megabytes, unless a limit refuses it, and is read by a process of its own that has read a small
