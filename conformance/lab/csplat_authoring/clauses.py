@@ -35,15 +35,13 @@ UNCOVERED: Final = {
     "CNF-9": "applies to a decoder's documentation",
 }
 
-_NAMES_MAX = 4
-_INTRO = (
-    "# Clauses and their vectors",
-    "",
-    "<!-- Written by csplat_authoring: do not edit. -->",
-    "The requirements of [format.md](../spec/format.md), then those of [encoders.md](../spec/encoders.md). The vectors",
-    "are in `csplat_conformance/vectors`.",
-    "",
-)
+_INTRO = """\
+# Clauses and their vectors
+
+<!-- Written by csplat_authoring: do not edit. -->
+Each requirement of [format.md](../spec/format.md), then of [encoders.md](../spec/encoders.md), with the vector that is most specific to it
+and the number of others. `csplat conformance decoder --filter CLAUSE` runs all of them.
+"""
 
 
 def specification() -> str:
@@ -57,17 +55,20 @@ def clause_ids(text: str) -> list[str]:
 
 
 def clause_map(text: str, vectors: Sequence[Vector]) -> str:
-    """Return the page, with a row for each clause."""
+    """Return the page, with a line for each clause that has vectors, and the reasons for those without."""
     covering: dict[str, list[str]] = {}
     for vector in vectors:
         for clause in vector.clauses:
             covering.setdefault(clause, []).append(vector.name)
-    lines = [*_INTRO, "| clause | vectors, or the reason for having none |", "|---|---|"]
+    lines = []
     for clause in clause_ids(text):
         # Invalid vectors come first: they are the most specific to a clause.
         names = sorted(covering.get(clause, []), key=lambda name: not name.startswith("invalid/"))
-        cell = ", ".join(f"`{name}`" for name in names[:_NAMES_MAX])
-        if len(names) > _NAMES_MAX:
-            cell += f" and {len(names) - _NAMES_MAX} more"
-        lines.append(f"| {clause} | {cell or UNCOVERED.get(clause, 'missing')} |")
-    return "\n".join(lines) + "\n"
+        if names:
+            lines.append(f"{clause:7} {names[0]}{f' +{len(names) - 1}' * (len(names) > 1)}")
+    reasons: dict[str, list[str]] = {}
+    for clause in clause_ids(text):
+        if clause not in covering:
+            reasons.setdefault(UNCOVERED.get(clause, "missing"), []).append(clause)
+    without = [f"- {', '.join(clauses)}: {reason}" for reason, clauses in reasons.items()]
+    return "\n".join([_INTRO, "```text", *lines, "```", "", "Without vectors:", "", *without]) + "\n"
