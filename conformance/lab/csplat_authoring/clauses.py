@@ -39,8 +39,8 @@ _INTRO = """\
 # Clauses and their vectors
 
 <!-- Written by csplat_authoring: do not edit. -->
-Each requirement of [format.md](../spec/format.md), then of [encoders.md](../spec/encoders.md), with the vector that is most specific to it
-and the number of others. `csplat conformance decoder --filter CLAUSE` runs all of them.
+Each requirement of [format.md](../spec/format.md), then of [encoders.md](../spec/encoders.md), with the vector that is
+most specific to it and the number of others. `csplat conformance decoder --filter CLAUSE` runs all of them.
 """
 
 
