@@ -8,6 +8,8 @@
     >>> model = csplat.decode(data)
     >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: reads only the parts it needs
     ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
+    >>> csplat.compare("scene.ply", "scene.csplat").psnr  # doctest: +SKIP
+    41.2
 
 Functions that read a *file* (`read`, `open`, `decode`) accept a path, an open binary file or bytes.
 `encode` takes a *scene*: a `SplatModel`, or a `Scene` of any size from `open`.
@@ -16,7 +18,8 @@ All errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError
 caller's data, `StoreError` a server. Errors of the operating system stay `OSError`s.
 
 Names are imported on first use (PEP 562): `import csplat.decoder` loads neither the encoder nor the PLY reader, so a
-decoder can be embedded alone.
+decoder can be embedded alone. `compare`, `finetune`, `render`, `simplify` and `train` are those of the other packages,
+which register them (`csplat.plugins`).
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from csplat.context import Context
@@ -50,6 +53,13 @@ if TYPE_CHECKING:
     from csplat.scene_metadata import SceneMetadata
     from csplat.splat_file import SplatFile
 
+    # Checkers that shall know their types import them from `csplat_tools`, `csplat_render` and `csplat_trainer`.
+    compare: Callable[..., Any]
+    finetune: Callable[..., Any]
+    render: Callable[..., Any]
+    simplify: Callable[..., Any]
+    train: Callable[..., Any]
+
 __version__ = "1.0.0"
 
 __all__ = [
@@ -69,19 +79,24 @@ __all__ = [
     "Target",
     "UnsupportedError",
     "__version__",
+    "compare",
     "decode",
     "decode_integers",
     "decode_scene",
     "encode",
     "encode_with_report",
     "extract",
+    "finetune",
     "from_gsplat",
     "lint_ply",
     "merge",
     "open",
     "read",
     "read_header",
+    "render",
+    "simplify",
     "to_gsplat",
+    "train",
     "write",
     "write_ply",
 ]
@@ -146,5 +161,6 @@ _MODULE_OF = {
     "to_gsplat": "csplat.interop",
     "write": "csplat.formats",
     "write_ply": "csplat.ply.ply_writer",
+    **dict.fromkeys(("compare", "finetune", "render", "simplify", "train"), "csplat.plugins"),
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

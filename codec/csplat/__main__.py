@@ -9,5 +9,5 @@ from importlib.metadata import entry_points
 if __name__ == "__main__":
     programs = entry_points(group="console_scripts", name="csplat")
     if not programs:
-        sys.exit("the command line of csplat is not installed: pip install csplat")
+        sys.exit("the command line of csplat is not installed: csplat has to be installed as a whole")
     programs["csplat"].load()()

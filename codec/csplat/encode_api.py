@@ -267,5 +267,5 @@ def _plugin(group: str, name: str, what: str) -> Any:
     """Load an entry point of a group; raise an `InputError` that names the feature `what` if it is absent."""
     plugin = load_plugins(group).get(name)
     if plugin is None:
-        raise InputError(f"no {what} is installed (entry points of {group}): pip install csplat")
+        raise InputError(f"no {what} is installed (entry points of {group}): csplat has to be installed as a whole")
     return plugin

@@ -15,6 +15,7 @@ interrupt, Ctrl-C, of a search for a target, and has the best result so far.
 
 from __future__ import annotations
 
+from shlex import quote
 from typing import Any
 
 
@@ -181,7 +182,8 @@ def missing_package(error: ModuleNotFoundError, package: str | None = None, *, e
         package: name of the package, if it differs from the module's.
         extra: extra of csplat that installs the package.
     """
-    return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
+    name = package or error.name
+    return InputError(f"this needs {name}, of the extra {extra}: pip install {quote(name or extra)}")
 
 
 def _join_detail(detail: str, found: object, wanted: object) -> str:

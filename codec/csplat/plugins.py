@@ -7,6 +7,7 @@
 | `csplat.display` | `html`: a function that converts a `SplatModel` to HTML for notebooks |
 | `csplat.search` | `target`: a `csplat.encode_api.Search`, which meets a `Target` by rendering |
 | `csplat.levels` | `builder`: a function of splat count, options and levels that returns a `LevelBuilder` or `None` |
+| `csplat.functions` | functions of the other packages that `csplat` offers under their own names |
 | `csplat.kernels` | `nearest_entries`: a function that returns an `encoder.entry_search.NearestEntries` or `None` |
 """
 
@@ -15,6 +16,8 @@ from __future__ import annotations
 import warnings
 from functools import cache
 from typing import TYPE_CHECKING, Any
+
+from csplat.errors import InputError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoints
@@ -35,6 +38,19 @@ def load_plugins(group: str) -> dict[str, Any]:
             text = f"{point.value}, installed as {point.name!r} of {group}, cannot be loaded: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
     return plugins
+
+
+def __getattr__(name: str) -> Any:
+    """Return a function of the group `csplat.functions`, for `csplat` to offer.
+
+    Raises:
+        InputError: the package that has it, or one that it requires, is not installed.
+    """
+    for point in _entry_points("csplat.functions").select(name=name):
+        return point.load()
+    if name.startswith("_"):
+        raise AttributeError(name)
+    raise InputError(f"csplat.{name} is not installed: csplat has to be installed as a whole")
 
 
 @cache

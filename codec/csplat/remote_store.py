@@ -293,7 +293,7 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
             options = _web_options(options)
         fs, path = url_to_fs(url, **options)
     except ImportError as error:  # fsspec's message names the package
-        raise InputError(f"{_redact(url)}: {_message(error)}; for HTTP and S3: pip install 'csplat[remote]'") from None
+        raise InputError(f"{_redact(url)}: {_message(error)}; for HTTP and S3: pip install aiohttp s3fs") from None
     except (ValueError, TypeError) as error:
         raise InputError(f"{_redact(url)}: {_message(error)}") from None
     return fs, path

@@ -164,7 +164,7 @@ def test_gradients_of_adversarial_splats_agree_with_autograd():
 
 def autograd():
     """Return the function of `torch_twin` for a render and its gradients."""
-    pytest.importorskip("torch", reason="autograd is that of torch: pip install 'csplat[train]'")
+    pytest.importorskip("torch", reason="autograd is that of torch: pip install torch")
     from torch_twin import autograd_gradients
 
     return autograd_gradients

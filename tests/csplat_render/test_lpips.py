@@ -27,7 +27,7 @@ def random_weights():
 
 @pytest.mark.long
 def test_lpips_of_the_published_images_agrees(data_dir):
-    Image = pytest.importorskip("PIL.Image", reason="reading PNG files needs pillow: pip install 'csplat[render]'")
+    Image = pytest.importorskip("PIL.Image", reason="reading PNG files needs pillow: pip install pillow")
     distance = load_lpips(data_dir / "lpips" / "lpips_alex.npz")
     images = (Image.open(data_dir / "lpips" / f"ex_{name}.png").convert("RGB") for name in ("ref", "p0", "p1"))
     reference, *others = (np.asarray(image, np.float32) / np.float32(255.0) for image in images)
@@ -54,7 +54,7 @@ def test_weights_are_saved_and_read_from_the_environment_before_the_cache(tmp_pa
 
 @pytest.mark.torch
 def test_weights_of_torch_files_are_equal(tmp_path, random_weights):
-    torch = pytest.importorskip("torch", reason="reading its cache needs torch: pip install 'csplat[train]'")
+    torch = pytest.importorskip("torch", reason="reading its cache needs torch: pip install torch")
     (tmp_path / "checkpoints").mkdir()
     backbone = {}
     for i, kernel, bias in zip(module._TORCH_INDEX, random_weights.kernels, random_weights.biases, strict=True):

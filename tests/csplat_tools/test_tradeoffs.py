@@ -145,6 +145,6 @@ def test_wrong_words_and_missing_packages_are_refused_before_any_work(sample_pat
     with pytest.raises(InputError, match="the scene has no splats"):
         tradeoff(make_model(0))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    line = "error: this needs matplotlib: pip install 'csplat[render]' (E_INPUT)\n"
+    line = "error: this needs matplotlib, of the extra render: pip install matplotlib (E_INPUT)\n"
     assert line == call("tradeoff", sample_path, "-o", tmp_path / "report.html", status=1).stderr
     assert hide_renderer(monkeypatch) == call("tradeoff", sample_path, status=1).stderr

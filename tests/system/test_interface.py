@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import EntryPoints
 
 import numpy as np
 import pytest
@@ -187,7 +188,7 @@ def test_a_search_and_a_builder_of_levels_are_called_by_their_entry_points(files
     wanted = {"target": target, "views": "views", "importance": weights, "levels": None, "context": csplat.Context()}
     assert wanted == named
     monkeypatch.setattr(place, lambda _: {})
-    with pytest.raises(InputError, match=r"no search for targets is installed.*pip install csplat"):
+    with pytest.raises(InputError, match=r"no search for targets is installed.*installed as a whole"):
         csplat.encode(files[0], target=target)
     with pytest.raises(InputError, match="no builder of levels of detail is installed"):
         csplat.encode(files[0], levels="auto")
@@ -328,3 +329,15 @@ def test_normalised_quats_have_unit_length_and_stay_unchanged():
     half = np.float32(np.sqrt(0.5))
     expected = [[1, 0, 0, 0], [half, 0, half, 0], [0, 1, 0, 0], [0, 0, 0, -1]]
     assert np.array_equal(normalise_quats(extremes), np.array(expected, np.float32))
+
+
+def test_functions_of_the_other_packages_are_offered_by_entry_points(monkeypatch):
+    for name, package in (
+        ("compare", csplat_tools), ("finetune", csplat_trainer), ("render", csplat_render), ("simplify", csplat_tools),
+        ("train", csplat_trainer),
+    ):  # fmt: skip
+        assert getattr(package, name) is getattr(csplat, name)
+        monkeypatch.delitem(vars(csplat), name)
+    monkeypatch.setattr("csplat.plugins._entry_points", lambda _: EntryPoints())
+    with pytest.raises(InputError, match=r"csplat\.compare is not installed"):
+        csplat.compare  # noqa: B018 -- the access is the test

@@ -131,7 +131,7 @@ class TradeoffRow:
         ratio: size of the source divided by the size of the file.
         splats: number of splats in the file.
         psnr, ssim: against the source's renders: PSNR pooled over all test views, dB; and mean SSIM.
-        image_scores: scores of the source (`a`) and of the file (`b`) against the images of a data set, as in
+        images: scores of the source (`a`) and of the file (`b`) against the images of a data set, as in
             `Comparison`; `None` without a data set.
         encode_seconds: time from the splats to the bytes, with all renders of a search.
         decode_seconds: time from the bytes to the splats.
@@ -144,19 +144,19 @@ class TradeoffRow:
     splats: int
     psnr: float
     ssim: float | None
-    image_scores: dict[str, Any] | None
+    images: dict[str, Any] | None
     encode_seconds: float
     decode_seconds: float
 
     @property
     def image_psnr(self) -> float | None:
         """PSNR against the images, dB."""
-        return None if self.image_scores is None else self.image_scores["b"]["psnr"]
+        return None if self.images is None else self.images["b"]["psnr"]
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        values = {name: value for name, value in vars(self).items() if name not in ("setting", "image_scores")}
-        return {"name": self.setting.name, **values, "images": self.image_scores}
+        values = {name: value for name, value in vars(self).items() if name not in ("setting", "images")}
+        return {"name": self.setting.name, **values, "images": self.images}
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,7 @@ class Tradeoff:
     @property
     def source_image_psnr(self) -> float | None:
         """The source's PSNR against the images, dB; `None` without images."""
-        scores = self.rows[0].image_scores
+        scores = self.rows[0].images
         return None if scores is None else scores["a"]["psnr"]
 
     def as_json(self) -> dict[str, Any]:
@@ -254,7 +254,7 @@ def tradeoff(
         words = (path, _suggested_name(path, setting), *setting.words, *(view_words if setting.target else ()))
         return TradeoffRow(
             setting, shlex.join(("csplat", "encode", *words)), len(made.data), source.size_bytes / len(made.data),
-            len(decoded), compared.quality.psnr, compared.quality.ssim, compared.image_scores, encode_seconds,
+            len(decoded), compared.psnr, compared.ssim, compared.images, encode_seconds,
             decode_seconds,
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Importance
-from csplat.errors import InputError
+from csplat.errors import InputError, missing_package
 from csplat.model import SplatModel
 from csplat.types import F32
 from csplat_render.camera import Camera
@@ -78,9 +78,8 @@ def make_rasteriser(device: Device, *, antialiased: bool, context: Context = DEF
     try:
         from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
         from csplat_trainer.torch_rasteriser import CpuRasteriser
-    except ImportError:
-        extra = "train" if device == "cpu" else "cuda"
-        raise InputError(f"torch is not installed (pip install 'csplat[{extra}]')") from None
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="train" if device == "cpu" else "cuda") from None
     if device == "cpu":
         return CpuRasteriser(antialiased=antialiased, context=context)
     return GsplatRasteriser(antialiased=antialiased)

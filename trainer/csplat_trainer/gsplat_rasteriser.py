@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from csplat.errors import InputError
+from csplat.errors import InputError, missing_package
 from csplat_render.camera import Camera
 from csplat_trainer.torch_parameters import upload
 from csplat_trainer.torch_rasteriser import SplatTensors, TorchRender
@@ -99,8 +99,8 @@ def gsplat_rasterization() -> Callable[..., Any]:
     try:
         from gsplat import rasterization
         from gsplat.cuda._backend import _C
-    except ImportError:
-        raise InputError("device cuda: the gsplat package is not installed (pip install 'csplat[cuda]')") from None
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="cuda") from None
     except (OSError, RuntimeError) as error:  # from the compiler
         raise InputError(f"device cuda: gsplat cannot be compiled: {_last_line(error)}") from None
     if _C is None:

@@ -26,7 +26,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.errors import InputError
+from csplat.errors import InputError, missing_package
 from csplat.types import F32, F64
 from csplat_render import kernels
 from csplat_render.camera import Camera
@@ -230,6 +230,6 @@ def _import_torch() -> Any:
     """Return the module torch, imported on use; raise an `InputError` if it is not installed."""
     try:
         import torch
-    except ImportError:
-        raise InputError("torch is not installed: pip install csplat[train]") from None
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="train") from None
     return torch

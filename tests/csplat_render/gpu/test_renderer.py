@@ -46,7 +46,7 @@ def device():
     try:
         return devices.open_device(software=True)
     except InputError as error:
-        pytest.skip(f"{error}: install csplat[gpu] and mesa-vulkan-drivers")
+        pytest.skip(f"{error}: install wgpu and mesa-vulkan-drivers")
 
 
 @pytest.fixture(scope="module")

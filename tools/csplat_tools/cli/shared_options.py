@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -28,9 +28,11 @@ from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import NUMBER, note, print_data
 from csplat_tools.file_streams import STANDARD_STREAM
-from csplat_tools.level_builder import LEVELS_MAX, LevelCount
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
+
+if TYPE_CHECKING:
+    from csplat_tools.level_builder import LevelCount
 
 T = TypeVar("T")
 N = TypeVar("N", int, float, int | None, float | None)
@@ -502,6 +504,8 @@ def parse_target(
 
 def parse_levels(text: str | None) -> LevelCount:
     """Parse a number of levels of detail, `auto` or `merged`; return `None` for `None`."""
+    from csplat_tools.level_builder import LEVELS_MAX  # takes 10 ms, which other commands do without
+
     if text is None or text == "auto" or text == "merged":
         return text  # type: ignore[return-value]  # mypy does not narrow a str by ==
     if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= LEVELS_MAX:

@@ -92,7 +92,7 @@ class Comparison:
             (`views_off_path`); empty with virtual views and out of core.
         ignored: number of splats of A that were not drawn because they hold NaN or infinities.
         cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
-        image_scores: scores of A's and B's renders against the images of a data set, as JSON of `Scores`, by the
+        images: scores of A's and B's renders against the images of a data set, as JSON of `Scores`, by the
             keys `split`, `a` and `b`; `None` without a data set.
         background, mode: background colour and renderer mode.
         notes: remarks about the views.
@@ -106,14 +106,29 @@ class Comparison:
     elsewhere: dict[str, float]
     ignored: int
     cameras: str
-    image_scores: dict[str, Any] | None
+    images: dict[str, Any] | None
     background: Colour
     mode: Mode
     notes: tuple[str, ...]
     seconds: float
 
     def __repr__(self) -> str:
-        return f"Comparison({self.a.size_bytes:,} -> {self.b.size_bytes:,} bytes, {self.quality.psnr:.2f} dB)"
+        return f"Comparison({self.a.size_bytes:,} -> {self.b.size_bytes:,} bytes, {self.psnr:.2f} dB)"
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of B's renders, dB, pooled over all views."""
+        return self.quality.psnr
+
+    @property
+    def ssim(self) -> float | None:
+        """SSIM of B's renders, mean over the views."""
+        return self.quality.ssim
+
+    @property
+    def lpips(self) -> float | None:
+        """LPIPS of B's renders, mean over the views; `None` without weights."""
+        return self.quality.lpips
 
     @property
     def ratio(self) -> float:
@@ -130,7 +145,7 @@ class Comparison:
             "cameras": self.cameras,
             "background": list(self.background),
             "mode": self.mode,
-            "images": self.image_scores,
+            "images": self.images,
             **self.quality.as_json(),
             "elsewhere": {kind: finite_or_none(psnr) for kind, psnr in self.elsewhere.items()},
             "ignored": {"a": self.ignored, "b": self.quality.ignored},
@@ -177,9 +192,9 @@ def compare(
             compared out of core.
 
     Examples:
-        >>> import csplat_tools
-        >>> comparison = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
-        >>> comparison.ratio, comparison.quality.psnr, comparison.attributes.errors["means"]  # doctest: +SKIP
+        >>> import csplat
+        >>> comparison = csplat.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
+        >>> comparison.ratio, comparison.psnr, comparison.attributes.errors["means"]  # doctest: +SKIP
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:

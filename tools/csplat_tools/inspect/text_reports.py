@@ -61,8 +61,8 @@ def format_comparison(compared: Comparison, a: str, b: str) -> str:
     else:
         parts.append(_attribute_errors(compared.attributes))
     parts.append(_scores(compared))
-    if compared.image_scores is not None:
-        parts.append(_image_scores(compared.image_scores))
+    if compared.images is not None:
+        parts.append(_image_scores(compared.images))
     parts.append(f"{compared.seconds:.1f} s")
     return "\n\n".join(parts)
 
