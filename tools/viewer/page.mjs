@@ -112,20 +112,24 @@ function limitsOf(text) {
 }
 
 /**
- * Fetch the cameras in the address.
+ * Read the cameras in the address.
  *
  * @param {string} text JSON, or its URL
  * @param {import('./types.d.ts').FetchOptions} [fetching]
- * @returns {Promise<unknown[]>} cameras of a camera file
+ * @returns {unknown[] | Promise<unknown[]>} cameras of a camera file; a promise if they have to be fetched
  */
-export async function fetchCameras(text, { fetch = globalThis.fetch, request } = {}) {
-  let json = text;
-  if (!/^\s*[[{]/.test(text)) {
-    const response = await fetch(text, request);
-    if (!response.ok) throw new Error(`${text}: HTTP status ${response.status}`);
-    json = await response.text();
-  }
-  return ownCameras(JSON.parse(json));
+export function readCameras(text, fetching = {}) {
+  return /^\s*[[{]/.test(text) ? ownCameras(JSON.parse(text)) : fetchCameras(text, fetching);
+}
+
+/**
+ * @param {string} url
+ * @param {import('./types.d.ts').FetchOptions} fetching
+ */
+async function fetchCameras(url, { fetch = globalThis.fetch, request }) {
+  const response = await fetch(url, request);
+  if (!response.ok) throw new Error(`${url}: HTTP status ${response.status}`);
+  return ownCameras(await response.json());
 }
 
 /**

@@ -75,15 +75,11 @@ export class TexelStream {
     const described = reader.describe({ signal });
     described.catch(() => {}); // it is waited for below
     const tiles = await TileStream.open(/** @type {any} */ (reader), aims, signal, { memoryOf });
-    tiles.amounts = Object.assign(amounts, {
-      phase: 'layers',
-      fileSize: header.fileSize,
-      splatCount: header.splatCount,
-    });
+    tiles.amounts = Object.assign(amounts, { fileSize: header.fileSize, splatCount: header.splatCount });
     const stream = new TexelStream(reader, tiles, sink, amounts, connection);
     tiles.prefetchRoots(signal); // together with the description
     sink.header({ header, description: await described, roots: tiles.roots.size, pages: tiles.memory.pages });
-    sink.progress(amounts);
+    amounts.phase = 'layers'; // from now on, views say what is missing
     return stream;
   }
 

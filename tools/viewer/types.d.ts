@@ -74,7 +74,7 @@ export interface Stats {
 }
 
 export interface Progress {
-  /** `open` until header and index have arrived, then `layers`. */
+  /** `open` until header, index and metadata have arrived, then `layers`. */
   phase: 'open' | 'layers';
   received: number;
   /** Bytes that the view requires and that have not arrived. */
@@ -205,8 +205,32 @@ export interface Engine {
   close(): void;
 }
 
+/** The element's own events, which do not bubble. */
+export interface CsplatViewEvents {
+  progress: CustomEvent<Progress>;
+  firstpicture: CustomEvent<Stats>;
+  load: CustomEvent<Stats>;
+  camerachange: CustomEvent<FileCamera>;
+  error: CustomEvent<ErrorReport>;
+}
+
 /** The element `<csplat-view>`. Properties other than those below reflect the attributes of the same name. */
 export interface CsplatViewElement extends HTMLElement {
+  addEventListener<K extends keyof CsplatViewEvents>(
+    type: K,
+    listener: (this: CsplatViewElement, event: CsplatViewEvents[K]) => void,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener<K extends Exclude<keyof HTMLElementEventMap, keyof CsplatViewEvents>>(
+    type: K,
+    listener: (this: CsplatViewElement, event: HTMLElementEventMap[K]) => void,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
   src: string;
   alt: string;
   /**

@@ -7,7 +7,7 @@ import { readCamera } from './autocamera.mjs';
 import { completeSize, fitCamera } from './camera_maths.mjs';
 import { createEngine } from './engine.mjs';
 import { E_INPUT, E_REPLACED, EngineError } from './engine_error.mjs';
-import { fetchCameras } from './page.mjs';
+import { readCameras } from './page.mjs';
 import { OrbitCamera } from './orbit_camera.mjs';
 import { CameraList, emptyPose } from './camera_list.mjs';
 import { CanvasSize } from './canvas_size.mjs';
@@ -151,19 +151,14 @@ export class SceneViewer {
   }
 
   /**
-   * Show other cameras, the first one at once.
+   * Show other cameras, the first one at once: before this returns, unless they have to be fetched.
    *
    * @param {Pick<import('./page.mjs').Wishes, 'camera' | 'view'>} wanted
    * @returns {Promise<string>} an error message, or ''
    */
   async useCameras({ camera, view }) {
     this.wishes = { ...this.wishes, camera, view };
-    const complaint = await this.readCameras();
-    if (complaint || this.wishes.camera !== camera) return complaint;
-    this.isSetting = true;
-    this.view.showFirst();
-    this.isSetting = false;
-    return '';
+    return this.readCameras(true);
   }
 
   /**
@@ -195,13 +190,19 @@ export class SceneViewer {
   /**
    * Read the requested cameras; an invalid one does not prevent the scene from loading.
    *
+   * @param {boolean} [isShown] whether to show the first one
    * @returns {Promise<string>} an error message, or ''
    */
-  async readCameras() {
+  async readCameras(isShown = false) {
     const { camera } = this.wishes;
     try {
-      const entries = camera === null ? null : await fetchCameras(camera, this.fetching);
-      if (this.wishes.camera === camera) this.view.useCameras(entries, this.wishes.view);
+      const read = camera === null ? null : readCameras(camera, this.fetching);
+      const entries = read instanceof Promise ? await read : read;
+      if (this.wishes.camera !== camera) return '';
+      this.view.useCameras(entries, this.wishes.view);
+      this.isSetting = true;
+      if (isShown) this.view.showFirst();
+      this.isSetting = false;
       return '';
     } catch (error) {
       return `The camera cannot be used: ${error instanceof Error ? error.message : error}`;

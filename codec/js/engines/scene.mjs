@@ -54,6 +54,7 @@ export async function openScene(from, options, target, signals = []) {
       life.onBytes();
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
+    options.onProgress?.(life.received, reader.header.fileSize); // a small file is here before its size is known
     const described = reader.describe({ signal });
     described.catch(() => {}); // it is waited for below
     const { extras, shDegree: most, coarseTiles } = reader.header;

@@ -216,6 +216,14 @@ for (const [name, options] of [
   });
 }
 
+test('progress ends with the size of the file, even if all of it comes at once', async () => {
+  const bytes = vector('valid/rich');
+  const seen = [];
+  const fetch = async () => new Response(bytes); // a server without ranges
+  await openScene('https://example.org/scene', { fetch, onProgress: (...now) => seen.push(now) }, TARGET);
+  assert.deepEqual(seen.at(-1), [bytes.length, bytes.length]);
+});
+
 test('a budget of splats selects the version of cut, renumbered', async () => {
   const bytes = vector('valid/levels_of_a_tree');
   const reader = await CsplatReader.open(new Blob([bytes]));

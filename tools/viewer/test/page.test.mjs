@@ -8,7 +8,7 @@ import * as spec from '../../../codec/js/spec.mjs';
 import { readCamera } from '../autocamera.mjs';
 import { saveUpCommand, upWord } from '../save_up.mjs';
 import { explain } from '../messages.mjs';
-import { fetchCameras, readWishes } from '../page.mjs';
+import { readCameras, readWishes } from '../page.mjs';
 
 test('an empty address has no parameters', () => {
   const { wishes, complaints } = readWishes(new URLSearchParams());
@@ -124,8 +124,8 @@ const FOREIGN = {
 };
 
 for (const [what, file] of Object.entries(FOREIGN)) {
-  test(`${what} gives cameras`, async () => {
-    const [entry] = await fetchCameras(JSON.stringify(file));
+  test(`${what} gives cameras`, () => {
+    const [entry] = readCameras(JSON.stringify(file));
     const { viewmat, lens } = readCamera(entry);
     assert.deepEqual(
       viewmat.map((value) => value + 0),
@@ -136,7 +136,7 @@ for (const [what, file] of Object.entries(FOREIGN)) {
   });
 }
 
-test('invalid cameras of other programs are refused', async () => {
+test('invalid cameras of other programs are refused', () => {
   const { frames, ...document } = FOREIGN['transforms.json'];
   const turned = [{ transform_matrix: [0, 1, 2, 3].map((k) => frames[0].transform_matrix.map((row) => row[k])) }];
   for (const [wrong, pattern] of [
@@ -145,14 +145,14 @@ test('invalid cameras of other programs are refused', async () => {
     [{ ...FOREIGN['a camera path of nerfstudio'], camera_type: 'equirectangular' }, /camera_type is equirectangular/],
     [[{ rotation: [1] }], /rotation and position/],
   ]) {
-    await assert.rejects(fetchCameras(JSON.stringify(wrong)), pattern);
+    assert.throws(() => readCameras(JSON.stringify(wrong)), pattern);
   }
 });
 
-test('the address may contain cameras', async () => {
-  assert.deepEqual(await fetchCameras(' [{"W": 1}, {"W": 2}]'), [{ W: 1 }, { W: 2 }]);
-  assert.deepEqual(await fetchCameras('{"W": 1}'), [{ W: 1 }]);
-  await assert.rejects(fetchCameras('[1'), SyntaxError);
+test('the address may contain cameras', () => {
+  assert.deepEqual(readCameras(' [{"W": 1}, {"W": 2}]'), [{ W: 1 }, { W: 2 }]);
+  assert.deepEqual(readCameras('{"W": 1}'), [{ W: 1 }]);
+  assert.throws(() => readCameras('[1'), SyntaxError);
 });
 
 test('every code of the format has a message', () => {

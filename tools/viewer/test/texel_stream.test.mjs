@@ -8,6 +8,7 @@ import { readHeader } from '../../../codec/js/decoder.mjs';
 import { HEADER_SIZE } from '../../../codec/js/spec.mjs';
 import { coarseBounds, fineBounds, weightedQuantile } from '../bounds.mjs';
 import { viewOf } from '../camera_maths.mjs';
+import { loadedShare } from '../statistics.mjs';
 import { TexelStream } from '../texel_stream.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
@@ -82,6 +83,19 @@ test('progress ends at the totals', async () => {
     assert.deepEqual(
       amounts,
       [...amounts].sort((a, b) => a - b),
+    );
+  }
+});
+
+test('the loaded share rises from 0 to 1', async () => {
+  for (const name of ['valid/rich', 'valid/levels']) {
+    const events = await loaded(new Blob([bytes(name)]));
+    const shares = events.filter(({ type }) => type === 'progress').map(loadedShare);
+    assert.deepEqual([shares[0], shares.at(-1)], [0, 1]);
+    assert.ok(shares.length > 4 && shares.filter((share) => share === 1).length <= 2, `${shares}`);
+    assert.deepEqual(
+      shares,
+      [...shares].sort((a, b) => a - b),
     );
   }
 });
