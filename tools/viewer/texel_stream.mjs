@@ -79,7 +79,7 @@ export class TexelStream {
     const stream = new TexelStream(reader, tiles, sink, amounts, connection);
     tiles.prefetchRoots(signal); // together with the description
     sink.header({ header, description: await described, roots: tiles.roots.size, pages: tiles.memory.pages });
-    amounts.phase = 'layers'; // from now on, views say what is missing
+    if (!tiles.hasLevels) amounts.phase = 'layers'; // otherwise a view says what is missing
     return stream;
   }
 
@@ -109,6 +109,7 @@ export class TexelStream {
       },
       progress: (place) => {
         if (place) connection.isLost = false;
+        if (tiles.view !== null) amounts.phase = 'layers';
         sink.progress(amounts);
       },
       warn: sink.warn,

@@ -74,7 +74,7 @@ export interface Stats {
 }
 
 export interface Progress {
-  /** `open` until header, index and metadata have arrived, then `layers`. */
+  /** `open` until it is known what the view requires, then `layers`. */
   phase: 'open' | 'layers';
   received: number;
   /** Bytes that the view requires and that have not arrived. */
