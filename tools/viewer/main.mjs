@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: an engine, a camera that the user moves, and the overlay.
 //
-// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
+// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // &controls=none&backend=webgl2
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
@@ -120,7 +120,7 @@ function shDegree(degree) {
 function turnUpright() {
   const { engine } = showing;
   if (!engine?.bounds) return;
-  const { up, isSaid } = view.turnUpright(engine.bounds, engine.stats.splatCount);
+  const { up, isSaid } = view.turnUpright();
   element('upright', HTMLElement).hidden = false; // allows turning the scene further
   if (isSaid) {
     keep.hide();

@@ -74,9 +74,9 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     frame = scene_frame(model.with_metadata(metadata))
     known = [] if frame.kind == "object" else cameras or _cameras_of(metadata)
     if known:
-        return metadata.with_entries(view=_as_entry(central_camera(known), TRAINED))
+        return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))
     cloud = sample_cloud(model, _POINTS, np.random.default_rng(0), every)
-    return metadata.with_entries(view=_as_entry(_estimate(metadata, cloud, frame), ESTIMATE))
+    return metadata.with_entries(view=view_entry(_estimate(metadata, cloud, frame), ESTIMATE))
 
 
 def _cameras_of(metadata: SceneMetadata) -> list[Camera]:
@@ -87,8 +87,8 @@ def _cameras_of(metadata: SceneMetadata) -> list[Camera]:
         return []
 
 
-def _as_entry(camera: Camera, source: str) -> dict[str, Any]:
-    """Return a camera as the entry `view`, with its source, a key of META."""
+def view_entry(camera: Camera, source: str) -> dict[str, Any]:
+    """Return a camera as the entry `view`, with its source: `TRAINED`, `ESTIMATE` or `AUTHOR`."""
     entry = {key: value for key, value in camera.to_json().items() if key != "image"}
     for name in ("K", "viewmat"):
         entry[name] = [[_rounded(value) for value in row] for row in entry[name]]

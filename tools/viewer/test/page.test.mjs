@@ -5,7 +5,7 @@ import { readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
-import { readCamera } from '../autocamera.mjs';
+import { readCamera } from '../../../codec/js/first_view.mjs';
 import { saveUpCommand, upWord } from '../save_up.mjs';
 import { explain } from '../messages.mjs';
 import { fetchCameras, readWishes } from '../page.mjs';
@@ -18,7 +18,6 @@ test('an empty address has no parameters', () => {
     camera: null,
     view: 0,
     up: null,
-    seems: null,
     axes: null,
     size: null,
     background: null,
