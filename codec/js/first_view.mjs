@@ -25,6 +25,7 @@ const ROTATION_TOLERANCE = 1e-2; // maximum of the entries of R Rᵀ − 1; came
 const HALF_FIELD = (25 * Math.PI) / 180; // of view of an estimate, radians; its picture is square
 const ASIDE = 0.4; // radians away from the front, where an object looks less flat
 const ELEVATION = 0.35; // radians above the horizon
+const MARGIN = 1.05; // of an estimate's picture, divided by the boxes in it
 const MOST = 0.9; // fraction of the splats that an estimate shows whole: some tiles hold far outliers
 
 /** Letters of directions, as used in files, and their opposites. */
@@ -142,7 +143,7 @@ export function directionOf(axes, letter) {
 }
 
 /**
- * Return a view of the ball of most splats from outside, slightly beside its front and from above.
+ * Return a view from outside of the boxes with most splats, slightly beside their front and from above.
  *
  * @param {Header} header
  * @param {ArrayLike<number>} up
@@ -158,11 +159,32 @@ function estimated(header, up) {
   const forward = [0, 1, 2].map((k) => c * (Math.cos(ASIDE) * ahead[k] - Math.sin(ASIDE) * right[k]) - s * up[k]);
   const across = unit(cross(forward, up));
   const rows = [across, cross(forward, across), forward];
-  const distance = radius / Math.sin(HALF_FIELD);
+  const distance = distanceOf(header, { centre, radius }, rows);
   const viewmat = [...rows.flatMap((row, i) => [...row, (i === 2 ? distance : 0) - dot(row, centre)]), 0, 0, 0, 1];
   const focal = 0.5 / Math.tan(HALF_FIELD);
   const lens = { fx: focal, fy: focal, cx: 0.5, cy: 0.5, W: 1, H: 1 };
   return { viewmat, lens, near: Math.min(DEFAULT_NEAR, NEAR_SHARE * radius) };
+}
+
+/**
+ * Return the distance of a camera from the centre of a ball at which it sees all boxes within the ball.
+ *
+ * @param {Header} header
+ * @param {{centre: Vec3, radius: number}} ball
+ * @param {number[][]} rows right, down and forward
+ */
+function distanceOf({ tiles }, { centre, radius }, [right, down, forward]) {
+  const slope = Math.tan(HALF_FIELD) / MARGIN;
+  const reach = radius * (1 + Number.EPSILON * 8);
+  let most = 0;
+  for (const { min, max } of tiles) {
+    for (let corner = 0; corner < 8; corner++) {
+      const p = centre.map((c, k) => ((corner >> k) & 1 ? max[k] : min[k]) - c);
+      const needed = Math.max(Math.abs(dot(right, p)), Math.abs(dot(down, p))) / slope - dot(forward, p);
+      if (needed > most && Math.hypot(...p) <= reach) most = needed;
+    }
+  }
+  return most || radius / slope;
 }
 
 /** @type {(values: number[], weights: number[]) => number} the weighted median: between both values that share it */

@@ -35,7 +35,7 @@ def encoded_once():
 
 
 @pytest.fixture
-def csplat_file(tmp_path, ply, encoded_once, no_first_view):
+def csplat_file(tmp_path, ply, encoded_once, no_first_view):  # noqa: ARG001  # the same bytes in every module
     """The file of `ply`, with its source index next to it."""
     names = ("scene.csplat", "index.npy")
     if not encoded_once:

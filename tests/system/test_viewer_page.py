@@ -16,6 +16,7 @@ from csplat import EncodeOptions, decode, encode, read_header
 from csplat.ply import read_ply
 from csplat_conformance.validator import validate
 from csplat_render import camera
+from csplat_render.camera_files import load_cameras
 from csplat_tools.level_builder import FittedLevelBuilder
 
 pytestmark = pytest.mark.slow
@@ -324,6 +325,27 @@ def test_turning_upright_can_be_kept(viewer, make_model):
         page.keyboard.press("u")
     assert "z is up, as in the file" == viewer.text("#toast")
     assert viewer.hides("#keep")
+
+
+def test_the_current_camera_can_be_kept_as_the_first_view(viewer, make_model, tmp_path):
+    viewer.show(encode(make_model(60, 1)))
+    page = viewer.page
+    page.keyboard.press("ArrowLeft", delay=30)
+    viewer.settle()
+    page.keyboard.press("v")
+    assert "csplat encode scene.ply scene.csplat --cameras view.json" == viewer.text("#keep-command")
+    name, text = downloaded(page, "#keep-camera")
+    _, kept = downloaded(page, "#keep-download")
+    assert "view.json" == name
+    view = decode(kept).metadata.entries["view"]
+    assert [{key: value for key, value in view.items() if key != "from"}] == json.loads(text)
+    assert "author" == view["from"]
+    assert validate(kept).conforms
+    before = viewer.viewmat
+    viewer.show(kept)
+    assert np.allclose(before, viewer.viewmat, atol=1e-6)
+    (tmp_path / name).write_bytes(text)
+    assert np.allclose(view["viewmat"], load_cameras(tmp_path / name)[0].viewmat)
 
 
 def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model):

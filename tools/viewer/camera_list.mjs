@@ -154,6 +154,11 @@ export class CameraList {
     return known.length ? upOfCameras(known) : null;
   }
 
+  /** Whether the scene has been turned to another up direction than the file's. */
+  get isTurned() {
+    return dot(this.up, this.#firstUp()) <= SAME;
+  }
+
   #firstUp() {
     return this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U');
   }
