@@ -88,8 +88,14 @@ def _cameras_of(metadata: SceneMetadata) -> list[Camera]:
 
 
 def view_entry(camera: Camera, source: str) -> dict[str, Any]:
-    """Return a camera as the entry `view`, with its source: `TRAINED`, `ESTIMATE` or `AUTHOR`."""
+    """Return a camera as the entry `view`, with the principal point in the middle of its image.
+
+    Args:
+        camera: the camera.
+        source: `TRAINED`, `ESTIMATE` or `AUTHOR`.
+    """
     entry = {key: value for key, value in camera.to_json().items() if key != "image"}
+    entry["K"][0][2], entry["K"][1][2] = camera.W / 2, camera.H / 2  # engines have no other principal point
     for name in ("K", "viewmat"):
         entry[name] = [[_rounded(value) for value in row] for row in entry[name]]
     return {**entry, "near": _rounded(camera.near), "from": source}
