@@ -230,6 +230,17 @@ def test_the_automatic_camera_sees_the_object_whatever_outliers_do(viewer, model
     assert 0.15 < (viewer.picture()[..., :3].max(axis=2) > 40).mean() < 0.9
 
 
+def test_the_camera_does_not_move_while_a_scene_loads(viewer, model):
+    viewer.site.bytes_per_second = 100_000
+    viewer.begin(encode(model, EncodeOptions(preset="fast", tile_splats=200)))
+    viewer.until("csplatViewer.engine?.bounds?.coarse")
+    first = viewer.viewmat
+    viewer.site.bytes_per_second = 0
+    viewer.page.evaluate("shown")
+    assert viewer.page.evaluate("!csplatViewer.engine.bounds.coarse")
+    assert first == viewer.viewmat
+
+
 def look_at(eye):
     K = [[90.0, 0.0, 40.0], [0.0, 90.0, 30.0], [0.0, 0.0, 1.0]]
     viewmat = camera.look_at(eye, (0, 0, 0), (0, -1, 0), K, 80, 60).viewmat.tolist()
