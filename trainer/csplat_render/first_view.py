@@ -58,7 +58,8 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
         every: number of splats of the full scene that each splat of the model represents.
 
     Returns:
-        Metadata with the keys `view` and, unless the estimate is uncertain, `up`; unchanged for a scene without splats.
+        Metadata with the keys `view` and, unless the estimate is uncertain, `up`. A scene without splats, or so large
+        that float32 does not hold its camera, gets no view.
 
     Examples:
         >>> import csplat
@@ -76,7 +77,10 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     if known:
         return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))
     cloud = sample_cloud(model, _POINTS, np.random.default_rng(0), every)
-    return metadata.with_entries(view=view_entry(_estimate(metadata, cloud, frame), ESTIMATE))
+    try:
+        return metadata.with_entries(view=view_entry(_estimate(metadata, cloud, frame), ESTIMATE))
+    except InputError:
+        return metadata
 
 
 def _cameras_of(metadata: SceneMetadata) -> list[Camera]:
@@ -171,8 +175,9 @@ def _is_room(points: F64, up: F64) -> bool:
         up: [3], unit length.
     """
     low, high = _box(points)
-    places = (points - low) / np.maximum(high - low, _TINY)  # 0 to 1 in the box
-    cells = np.clip((places * _WALL_CELLS).astype(np.int64), 0, _WALL_CELLS - 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        places = np.clip((points - low) / np.maximum(high - low, _TINY), -1.0, 2.0)  # 0 to 1 in the box
+        cells = np.nan_to_num(np.clip(places * _WALL_CELLS, 0, _WALL_CELLS - 1)).astype(np.int64)
     closed = np.zeros((3, 2), bool)
     for axis in range(3):
         u, v = (k for k in range(3) if k != axis)
