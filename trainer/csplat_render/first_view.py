@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from csplat_render.virtual_cameras import HIDING
 SAMPLE_SPLATS = 50_000
 
 _POINTS = 16_000  # cloud points
+_USUAL_UP = (0.0, -1.0, 0.0)  # what viewers assume of scenes of unknown axes
 _FIELD_OF_VIEW = 50.0  # degrees, of a square image: viewers fit all of it into their canvas, wide or tall
 _SIDE = 640  # pixels of the image's side
 _TURNS = 24  # number of azimuths to try
@@ -73,6 +75,8 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     if VIEW in metadata.entries or not len(model):
         return metadata
     frame = scene_frame(model.with_metadata(metadata))
+    if metadata.up is None:
+        frame = replace(frame, up=np.array(_USUAL_UP))
     known = [] if frame.kind == "object" else cameras or _cameras_of(metadata)
     if known:
         return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))
