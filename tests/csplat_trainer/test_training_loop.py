@@ -125,7 +125,7 @@ def test_splats_start_within_the_hull_of_all_masks_or_in_a_box(data, make_model)
 
 
 def test_the_first_view_of_surroundings_is_a_training_camera(data):
-    assert "view" not in train(data, brief(strategy="none")).model.metadata.entries  # an object
+    assert "estimate" == train(data, brief(strategy="none")).model.metadata.entries["view"]["from"]  # an object
     rng = np.random.default_rng(0)
     far = rng.standard_normal((60, 3)) * 40.0
     points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)

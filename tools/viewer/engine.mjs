@@ -372,10 +372,10 @@ class SplatEngine {
     return encodeImage(pixels, view, type, quality);
   }
 
-  /** @param {[number, number, number]} up */
-  fileWithUp(up) {
+  /** @param {import('./types.d.ts').MetadataChanges} changes */
+  fileWith(changes) {
     const { port1, port2 } = new MessageChannel();
-    this.worker.postMessage({ type: 'rewrite', up, port: port2 }, [port2]);
+    this.worker.postMessage({ type: 'rewrite', changes, port: port2 }, [port2]);
     return new Promise((/** @type {(bytes: Uint8Array<ArrayBuffer>) => void} */ resolve, reject) => {
       port1.onmessage = (/** @type {{data: import('./worker.mjs').Rewritten}} */ { data: { bytes, error } }) => {
         port1.close();

@@ -5,7 +5,7 @@ import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { chooseTiles } from '../../codec/js/levels/level_cut.mjs';
 import { cull } from './cull.mjs';
 import { pageFunctions } from './fetch_port.mjs';
-import { withUp } from './meta_writer.mjs';
+import { withMetadata } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
 import { TexelStream } from './texel_stream.mjs';
 
@@ -21,7 +21,7 @@ import { TexelStream } from './texel_stream.mjs';
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
  *   | {type: 'pause', isPaused: boolean}
- *   | {type: 'rewrite', up: number[], port: MessagePort}
+ *   | {type: 'rewrite', changes: import('./types.d.ts').MetadataChanges, port: MessagePort}
  *   | {type: 'stop'}} Request
  *
  * How to fetch: options of the engine that can be sent, and whether the page has functions for the others.
@@ -104,7 +104,7 @@ class Job {
     } else if (request.type === 'pause') {
       this.isPaused = request.isPaused;
       this.stream?.tiles.pause(this.isPaused);
-    } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
+    } else if (request.type === 'rewrite') this.rewrite(request.changes, request.port);
     else if (request.type === 'stop') this.reset();
     else if (this.spare.length < 2) this.spare.push(request.order);
   }
@@ -151,14 +151,14 @@ class Job {
   }
 
   /**
-   * Send the scene's file with another up direction.
+   * Send the scene's file with other metadata.
    *
-   * @param {number[]} up
+   * @param {import('./types.d.ts').MetadataChanges} changes
    * @param {MessagePort} port
    */
-  async rewrite(up, port) {
+  async rewrite(changes, port) {
     try {
-      const bytes = await withUp(await whole(this.source, this.fetching), up);
+      const bytes = await withMetadata(await whole(this.source, this.fetching), changes);
       port.postMessage({ bytes }, [bytes.buffer]);
     } catch (error) {
       port.postMessage({ error: reportOf(error, true) });

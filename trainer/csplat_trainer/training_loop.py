@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,11 @@ import csplat
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_metadata import TRAINING, VIEW
+from csplat.scene_metadata import TRAINING
 from csplat.types import F32, I64
-from csplat_render.camera import Camera, central_camera
+from csplat_render.first_view import viewing_metadata
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import Lpips, load_lpips
-from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.device_measurements import make_rasteriser
 from csplat_trainer.engine import CpuEngine, Engine
@@ -321,15 +320,14 @@ class _Training:
         )  # fmt: skip
 
     def _model(self) -> SplatModel:
-        """Return the scene, with the training's record, up direction and origin, and a first view of surroundings."""
+        """Return the scene, with the training's record, up direction, first view and origin."""
         model = to_model(self._engine.parameters.on_cpu().values, antialiased=self._options.antialiased)
         entries = {TRAINING: self._data.trained_on(self._colour).as_json()}
-        if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
-            entries[VIEW] = _first_view([image.camera for image in self._data.train])
         metadata = replace(model.metadata, entries=entries).with_up(
             self._data.up, self._data.coordinate_system, estimated=self._data.up_is_estimated
         )
-        return replace(model, metadata=metadata, origin=self._data.origin)
+        model = replace(model, metadata=metadata, origin=self._data.origin)
+        return model.with_metadata(viewing_metadata(model, [image.camera for image in self._data.train]))
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
         """Return the log of the steps with facts on the run; gains and biases of images if they were trained."""
@@ -396,16 +394,6 @@ def _expected_shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
     sh = values["shN"].shape[1:] if "shN" in values else ()
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "logits": (), "sh0": (3,), "shN": (*sh[:1], 3)}
     return {name: (len(values.get("logits", ())), *row) for name, row in rows.items()}
-
-
-def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Return the central camera as the entry `view` (spec 5.4), to seven digits."""
-    camera = central_camera(cameras)
-    matrices = {
-        name: [[float(f"{value:.7g}") for value in row] for row in matrix.tolist()]
-        for name, matrix in (("K", camera.K), ("viewmat", camera.viewmat))
-    }
-    return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}"), "from": "training"}
 
 
 def _load_lpips_weights(options: TrainOptions, outputs: Outputs) -> Lpips | None:
