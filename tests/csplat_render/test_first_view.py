@@ -10,6 +10,8 @@ from cameras_cases import ball, figure, niche
 from checked import cloud
 from models import with_facts
 
+import csplat
+from csplat.errors import InputError
 from csplat_render.camera import Camera, intrinsics, look_at
 from csplat_render.first_view import SAMPLE_SPLATS, viewing_metadata
 from csplat_render.scene_frame import scene_frame
@@ -106,3 +108,10 @@ def test_the_view_is_short():
     view = viewing_metadata(ball()).entries["view"]
     assert len(json.dumps(view, separators=(",", ":"))) < 300
     assert viewing_metadata(ball()).entries["view"] == view
+
+
+def test_a_render_without_a_camera_shows_the_first_view(make_model):
+    model = ball(300)
+    assert np.array_equal(csplat.render(model, first_view(model)[0]).rgb, csplat.render(model).rgb)
+    with pytest.raises(InputError, match="no camera is given"):
+        csplat.render(make_model(0, 0))

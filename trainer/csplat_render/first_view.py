@@ -87,6 +87,18 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
         return metadata
 
 
+def first_view(model: object) -> Camera:
+    """Return the first view of a `SplatModel`: the one that its metadata state, or that `viewing_metadata` chooses.
+
+    Raises:
+        InputError: it has none, or is not a `SplatModel`.
+    """
+    view = viewing_metadata(model).entries.get(VIEW) if isinstance(model, SplatModel) else None
+    if not isinstance(view, dict):
+        raise InputError("no camera is given, and what is to be rendered has no first view")
+    return Camera.from_json(view)
+
+
 def _cameras_of(metadata: SceneMetadata) -> list[Camera]:
     """Return the cameras of the metadata; none if one is invalid."""
     try:
