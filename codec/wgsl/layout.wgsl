@@ -91,10 +91,13 @@ fn read_centre(tile: Tile, index: u32) -> vec3<f32> {
 }
 
 fn read_opacity(tile: Tile) -> f32 {
-  let value = number(tile.opacity_bits);
-  if (tile.opacity_bits == 32u) { return value; }
-  let share = value / tile.opacity_levels;
-  return select(share, share * share, (tile.flags & OPACITY_SQUARED) != 0u);
+  var opacity = number(tile.opacity_bits);
+  if (tile.opacity_bits != 32u) {
+    opacity /= tile.opacity_levels;
+    if ((tile.flags & OPACITY_SQUARED) != 0u) { opacity *= opacity; }
+  }
+  let hidden = tile.flags >> 26u; // eighths of the optical depth, of a tile that fades
+  return select(1.0 - pow(1.0 - min(opacity, 0.99), 1.0 - f32(hidden) / 8.0), opacity, hidden == 0u);
 }
 
 fn read_log_scales(tile: Tile) -> vec3<f32> {

@@ -444,7 +444,7 @@ class SplatEngine {
       this.fail(error);
     }
     if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
-    if (['header', 'band', 'cut', 'order', 'done'].includes(reply.type)) this.requestFrame();
+    if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
     this.wake();
   }
 

@@ -49,7 +49,8 @@ import { WebGpuRenderer } from './webgpu.mjs';
  *   tile, after the table it refers to; a codebook's lowest band first
  * @property {() => void} complete everything has been uploaded: free reserved memory
  * @property {(order: Uint32Array, count: number) => void} setOrder slots, farthest first
- * @property {(tiles: Uint32Array) => void} setCut the tiles to draw, for renderers that sort; all if it is never called
+ * @property {(shares: Map<number, number>) => void} setShares the tiles to draw, and their shares, see `fadedAlpha`; all of
+ *   all tiles if it is never called
  * @property {(view: import('./types.d.ts').View, look: Look) => void} draw to the canvas, which has the size of the view
  * @property {(view: import('./types.d.ts').View, look: Look) => Uint8Array<ArrayBuffer> | Promise<Uint8Array<ArrayBuffer>>} pixelsOf draw a picture of
  *   any size and return it: RGBA, premultiplied, top row first; empty if the GPU is lost. Throws a RangeError if there is not

@@ -81,7 +81,6 @@ export class SceneLoad {
       this.resident.delete(reply.tile);
     } else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
     else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
-    else if (reply.type === 'cut') renderer.setCut(reply.tiles);
     else if (reply.type === 'order') this.#takeOrder(reply, renderer);
     else if (reply.type === 'error') {
       if (reply.error.fatal) throw new EngineError(reply.error);
@@ -120,6 +119,7 @@ export class SceneLoad {
         opacitySquare: opacities.mapping === 'square',
         quatLevels: quats.levels,
       });
+      renderer.setShares(new Map());
     } catch (error) {
       if (error instanceof RangeError) throw new EngineError({ code: E_LIMIT, message: error.message });
       throw error;
@@ -156,7 +156,8 @@ export class SceneLoad {
    * @param {Reply & {type: 'order'}} reply
    * @param {Renderer} renderer
    */
-  #takeOrder({ id, isComplete, isWhole, order, count, cullMs, sortMs }, renderer) {
+  #takeOrder({ id, isComplete, isWhole, shares, order, count, cullMs, sortMs }, renderer) {
+    if (shares) renderer.setShares(shares);
     renderer.setOrder(order, count);
     this.order = { id, isComplete, isWhole };
     Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, and the order.
 
+import { FADE_STEPS } from '../../codec/js/levels/shown_tiles.mjs';
 import { toCamera } from './camera_maths.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
 import { UNITS } from './shader_programs.mjs';
-import { BAND_CODEBOOK, BAND_ROWS, tileTexels } from './shader_attributes.mjs';
+import { BAND_CODEBOOK, BAND_ROWS, FADE_SHIFT, tileTexels } from './shader_attributes.mjs';
 import { Records } from './framebuffers.mjs';
 import { LinearTexture, Store, formats } from './textures.mjs';
 
@@ -131,6 +132,17 @@ export class SceneTextures {
     for (const key of this.indices.keys()) if (key.startsWith(`${tile}.`)) this.indices.delete(key);
     const first = 4 * this.tileTexels * tile;
     this.constants.fill(0, first, first + 4 * this.tileTexels);
+  }
+
+  /** @param {Map<number, number>} shares of the tiles that are drawn */
+  setShares(shares) {
+    for (const [tile, some] of shares) {
+      const at = 4 * this.tileTexels * tile;
+      const word = (this.constants[at] % 2 ** FADE_SHIFT) + (FADE_STEPS - some) * 2 ** FADE_SHIFT;
+      if (word === this.constants[at]) continue;
+      this.constants[at] = word;
+      this.putConstants(tile);
+    }
   }
 
   /** @param {number} tile */

@@ -15,6 +15,9 @@ export const BAND_NONE = 0;
 export const BAND_ROWS = 1;
 export const BAND_CODEBOOK = 2;
 
+/** Position, in the first word of a tile's constants, of the shares of its optical depth that are not drawn. */
+export const FADE_SHIFT = 25;
+
 /** Reads the fields of a splat in order. */
 export const READ_GEOMETRY = `
 uniform usampler2D uFirst; // first texel of each splat

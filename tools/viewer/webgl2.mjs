@@ -119,7 +119,10 @@ export class WebGl2Renderer {
     this.scene?.putOrder(order, count);
   }
 
-  setCut() {}
+  /** @param {Map<number, number>} shares */
+  setShares(shares) {
+    this.scene?.setShares(shares);
+  }
 
   /**
    * @param {View} view

@@ -185,9 +185,9 @@ export class WebGpuRenderer {
 
   setOrder() {}
 
-  /** @param {Uint32Array} tiles */
-  setCut(tiles) {
-    this.scene?.setCut(tiles);
+  /** @param {Map<number, number>} shares */
+  setShares(shares) {
+    this.scene?.setShares(shares);
   }
 
   /**

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The memory of one scene on a WebGPU device. csplat_render/gpu/packing.py describes the layout.
 
+import { FADE_STEPS } from '../../codec/js/levels/shown_tiles.mjs';
 import { toCamera } from './camera_maths.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
 import { Words } from './webgpu_device.mjs';
@@ -29,6 +30,7 @@ const BAND_CODEBOOK = 2;
 const FLOAT_MAX = 3.4e38;
 const SQUARED = 1 << 24;
 const ANTIALIASED = 1 << 25;
+const FADE_SHIFT = 26; // of the shares that are not drawn
 
 export class GpuScene {
   /**
@@ -60,8 +62,8 @@ export class GpuScene {
     this.indices = new Map();
     this.constants = new Uint32Array(TEXEL_WORDS * TILE_ROWS * tiles.length);
     this.places = new Float32Array(TEXEL_WORDS * tiles.length);
-    /** Which tiles are drawn; null for all. @type {Set<number> | null} */
-    this.cut = null;
+    /** Shares of the tiles that are drawn; null for all of all. @type {Map<number, number> | null} */
+    this.shares = null;
   }
 
   get bytes() {
@@ -209,16 +211,17 @@ export class GpuScene {
   #putConstants(tile) {
     const words = TEXEL_WORDS * TILE_ROWS;
     const constants = this.constants.slice(words * tile, words * (tile + 1));
-    if (this.cut && !this.cut.has(tile)) constants[3] = 0; // no splats
+    const shares = this.shares ? (this.shares.get(tile) ?? 0) : FADE_STEPS;
+    constants[3] = shares === 0 ? 0 : constants[3] | ((FADE_STEPS - shares) << FADE_SHIFT); // 0: no splats
     this.#write(16 * (this.tileTable + TILE_ROWS * tile), constants);
   }
 
-  /** @param {Uint32Array} tiles the tiles to draw */
-  setCut(tiles) {
-    const before = this.cut;
-    this.cut = new Set(tiles);
+  /** @param {Map<number, number>} shares of the tiles to draw */
+  setShares(shares) {
+    const before = this.shares;
+    this.shares = shares;
     for (let tile = 0; tile < this.layout.tiles.length; tile++) {
-      if (before?.has(tile) !== this.cut.has(tile)) this.#putConstants(tile);
+      if (before === null || before.get(tile) !== shares.get(tile)) this.#putConstants(tile);
     }
   }
 

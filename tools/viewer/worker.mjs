@@ -2,7 +2,7 @@
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
-import { chooseTiles } from '../../codec/js/levels/level_cut.mjs';
+import { STEP_MS, ShownTiles } from '../../codec/js/levels/shown_tiles.mjs';
 import { cull } from './cull.mjs';
 import { pageFunctions } from './fetch_port.mjs';
 import { withUp } from './meta_writer.mjs';
@@ -37,21 +37,21 @@ import { TexelStream } from './texel_stream.mjs';
  *
  * @typedef {{scene: number} & (
  *   | {type: 'header', opened: import('./texel_stream.mjs').Opened}
- *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
  *   | {type: 'geometry', tile: number, slot: number, texels: import('./texels.mjs').GeometryTexels,
  *      samples: import('./texel_stream.mjs').Samples}
  *   | {type: 'evict', tile: number}
  *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
  *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
- *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
- *      cullMs: number, sortMs: number}
+ *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, shares: Map<number, number> | null,
+ *      order: Uint32Array<ArrayBuffer>, count: number, cullMs: number, sortMs: number}
  *   | {type: 'done'}
  *   | {type: 'ask', question: import('./fetch_port.mjs').Question, port: MessagePort}
  *   | {type: 'error', error: ErrorReport})} Reply
  *
- * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires was here. `done`:
- * so it was for the first time.
+ * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires is drawn, and
+ * nothing fades; `shares` of the tiles that are drawn, null if they have not changed. `done`: everything that a view requires was
+ * here for the first time.
  */
 
 /** Minimum interval between sorts while tiles arrive. */
@@ -78,12 +78,10 @@ class Job {
     this.stream = null;
     /** Tiles that are drawn. @type {CullTile[]} */
     this.drawn = [];
-    /** Nodes that finer ones are drawn for. @type {Set<number>} */
-    this.refined = new Set();
-    this.isWhole = false; // `drawn` covers the whole scene
+    /** @type {ShownTiles | null} */
+    this.shown = null;
     this.isDone = false; // everything that a view requires was here once
     this.isPaused = false;
-    this.splatCount = 0; // number of splats in `drawn`
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorts = true;
@@ -116,9 +114,8 @@ class Job {
     this.abort = new AbortController();
     this.stream = null;
     this.drawn = [];
-    this.refined = new Set();
-    this.isWhole = this.isDone = false;
-    this.splatCount = 0;
+    this.shown = null;
+    this.isDone = false;
     this.spare = [];
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     this.sorter = new DepthSorter();
@@ -141,6 +138,7 @@ class Job {
     try {
       const stream = await TexelStream.open(source, this.sink(post), aims, signal, this.fetching);
       this.stream = stream;
+      this.shown = new ShownTiles(stream.tiles);
       stream.tiles.pause(this.isPaused);
       stream.tiles.setView(this.camera?.view ?? null);
       await stream.tiles.failed;
@@ -171,10 +169,7 @@ class Job {
    */
   sink(post) {
     return {
-      header: (opened) => {
-        post({ type: 'header', opened });
-        if (!this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
-      },
+      header: (opened) => post({ type: 'header', opened }),
       geometry: (tile, texels, { slot }, samples) => {
         const transfer = [texels.first.buffer, samples.points.buffer, samples.weights.buffer];
         if (texels.more) transfer.push(texels.more.buffer);
@@ -204,30 +199,6 @@ class Job {
   }
 
   /**
-   * Choose the tiles to draw, of those that are here.
-   *
-   * @param {TexelStream} stream
-   */
-  choose({ here, tiles: { nodes, looks, aims, hasLevels } }) {
-    const { tiles, isWhole, refined } = chooseTiles(
-      nodes,
-      (tile) => here.has(tile),
-      looks,
-      hasLevels ? aims.budget : Infinity,
-      this.refined,
-    );
-    const before = this.drawn;
-    this.drawn = tiles.flatMap((tile) => here.get(tile) ?? []);
-    this.isWhole = isWhole;
-    this.refined = refined;
-    this.splatCount = this.drawn.reduce((sum, { count }) => sum + count, 0);
-    const isNew = this.drawn.length !== before.length || this.drawn.some((tile, i) => tile !== before[i]);
-    if (isNew && !this.sorts) {
-      this.scope.postMessage({ type: 'cut', scene: this.scene, tiles: Uint32Array.from(tiles) });
-    }
-  }
-
-  /**
    * Sort after the messages that are already queued, so that only the latest camera is sorted for.
    *
    * @param {number} interval minimum time since the last sort, milliseconds
@@ -243,13 +214,20 @@ class Job {
   }
 
   sort() {
-    const { stream, camera } = this;
-    if (camera === null || stream === null) return;
+    const { scene, stream, shown, camera, visible } = this;
+    if (camera === null || stream === null || shown === null) return;
     const { id, view } = camera;
-    if (stream.tiles.view !== view) stream.tiles.setView(view);
-    this.choose(stream);
-    const { scene, splatCount, visible, isWhole } = this;
-    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete: stream.tiles.isComplete, isWhole });
+    const { here, tiles } = stream;
+    const { shares: before } = shown;
+    if (tiles.view !== view) tiles.setView(view);
+    shown.update((tile) => here.has(tile), performance.now());
+    const { isFading, isWhole, splatCount } = shown;
+    const shares = shown.shares === before ? null : shown.shares;
+    if (shares) this.drawn = Array.from(shares.keys(), (tile) => /** @type {CullTile} */ (here.get(tile)));
+    const isComplete = tiles.isComplete && !isFading;
+    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete, isWhole, shares });
+    this.sortedAt = performance.now();
+    if (isFading) this.sortSoon(STEP_MS);
     if (!this.sorts) {
       this.scope.postMessage({ ...reply, order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 });
       return;

@@ -4,6 +4,7 @@
 
 import * as pc from 'playcanvas';
 
+import { FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
 import { openScene } from './scene.mjs';
@@ -30,6 +31,7 @@ uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whe
 uniform vec4 csOther; // lowest integer and step of colours, lowest integer and unit of quats
 uniform vec4 csLows;  // lowest integers of SH bands; whether splats are discs
 uniform vec4 csSteps;
+uniform float csFade; // share of the optical depth
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 vec3 getCenter() {
   uvec4 mean = loadCsMeans();
@@ -54,6 +56,7 @@ vec3 getScale() {
 vec4 getColor() {
   float alpha = float(loadCsShapes().w) / csShape.z;
   if (csShape.w > 0.5) alpha *= alpha;
+  if (csFade < 1.0) alpha = 1.0 - pow(1.0 - min(alpha, 0.99), csFade);
   return vec4(0.5 + 0.28209479177387814 * (vec3(loadCsColours().xyz) + csOther.x) * csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -81,6 +84,7 @@ uniform csShape: vec4f;
 uniform csOther: vec4f;
 uniform csLows: vec4f;
 uniform csSteps: vec4f;
+uniform csFade: f32;
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 fn getCenter() -> vec3f {
   let mean = loadCsMeans();
@@ -105,6 +109,7 @@ fn getScale() -> vec3f {
 fn getColor() -> vec4f {
   var alpha = f32(loadCsShapes().w) / uniform.csShape.z;
   if (uniform.csShape.w > 0.5) { alpha *= alpha; }
+  if (uniform.csFade < 1.0) { alpha = 1.0 - pow(1.0 - min(alpha, 0.99), uniform.csFade); }
   return vec4f(0.5 + 0.28209479177387814 * (vec3f(loadCsColours().xyz) + uniform.csOther.x) * uniform.csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -151,12 +156,12 @@ class CsplatResource extends pc.GSplatResourceBase {
     /** What draws levels of detail. @type {TileEntities | null} */
     this.tiles = null;
     this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
-    this.add(images, parameters, 0);
+    this.add(images, { ...parameters, csFade: 1 }, 0);
   }
 
   /**
    * @param {Record<string, Image>} images
-   * @param {Record<string, number[]>} parameters
+   * @param {Record<string, number | number[]>} parameters
    * @param {number} degree SH degree now available
    */
   add(images, parameters, degree) {
@@ -253,8 +258,9 @@ class TileEntities {
   /**
    * @param {number} index
    * @param {LoadedTile} tile
+   * @param {number} shares
    */
-  show(index, tile) {
+  show(index, tile, shares) {
     const { scene, app, options } = this;
     const record = { ...allTiles(scene.file)[index], index: 0, first: 0 };
     const header = { ...scene.file, tiles: [record], splatCount: tile.count };
@@ -267,7 +273,19 @@ class TileEntities {
       options,
     );
     this.shown.set(index, { tile, resource, children: new Map() });
+    this.fade(index, shares);
     this.band(index);
+  }
+
+  /**
+   * @param {number} index
+   * @param {number} shares
+   */
+  fade(index, shares) {
+    const one = this.shown.get(index);
+    one?.resource.parameters.set('csFade', shares / FADE_STEPS);
+    for (const { gsplat } of one?.children.values() ?? [])
+      if (gsplat) gsplat.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
   }
 
   /** @param {number} index a tile to which a band was added: they are drawn when all of them are here */

@@ -94,7 +94,9 @@ export class TileStream {
     /** Tiles of the coarsest version. */
     this.roots = new Set(roots.flatMap(({ firstTile, tileCount }) => tilesOf(firstTile, tileCount)));
     this.hasLevels = this.roots.size < this.all.length;
-    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * Math.max(aims.budget, this.rootSplats) : Infinity);
+    /** Number of splats that are drawn at most, unless the coarsest version has more. */
+    this.budget = Math.max(aims.budget, this.rootSplats);
+    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * this.budget : Infinity);
     this.slots = new Ranges(this.memory.pages);
     /** Tiles whose layer 0 is here, and their slots. @type {Map<number, number>} */
     this.here = new Map();
