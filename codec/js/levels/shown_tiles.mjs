@@ -62,10 +62,14 @@ export class ShownTiles {
    * @param {number} [least] error, in pixels, up to which nodes stay
    */
   update(isHere, now, least) {
-    const { stream, shares: before, isFading, isWhole: wasWhole } = this;
+    const { stream, isWhole: wasWhole } = this;
     const { nodes, looks, budget, hasLevels } = stream;
-    const areHere = [...before.keys()].every(isHere);
-    if (isFading && areHere) return this.#advance(Math.round((now - this.steppedAt) / STEP_MS), now);
+    const areHere = [...this.shares.keys()].every(isHere);
+    if (this.isFading && areHere) {
+      this.#advance(Math.round((now - this.steppedAt) / STEP_MS), now);
+      if (this.isFading) return;
+    }
+    const { shares: before } = this;
     const most = hasLevels ? budget : Infinity;
     const { tiles, isWhole, refined } = chooseTiles(nodes, isHere, looks, most, this.refined, least);
     this.isWhole = isWhole;
