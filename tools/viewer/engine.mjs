@@ -443,6 +443,7 @@ class SplatEngine {
       this.tell({ type: 'stop' });
       this.fail(error);
     }
+    if (reply.type === 'geometry' || reply.type === 'band') this.tell({ type: 'placed', scene: reply.scene });
     if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
     if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
     this.wake();

@@ -532,8 +532,8 @@ fn read_opacity(tile: Tile) -> f32 {
     opacity /= tile.opacity_levels;
     if ((tile.flags & OPACITY_SQUARED) != 0u) { opacity *= opacity; }
   }
-  let hidden = tile.flags >> 26u;
-  return select(1.0 - pow(1.0 - min(opacity, 0.99), 1.0 - f32(hidden) / 8.0), opacity, hidden == 0u);
+  let hidden = f32(tile.flags >> 26u) / 8.0;
+  return opacity * (1.0 - hidden) * (1.0 + 0.34 * opacity * hidden);
 }
 fn read_log_scales(tile: Tile) -> vec3<f32> {
   return values(tile.scale_bits, bitcast<vec4<f32>>(tiles[tile.row + 2u]));

@@ -20,6 +20,7 @@ import { TexelStream } from './texel_stream.mjs';
  *      aims: import('../../codec/js/levels/tile_stream.mjs').Aims, fetching: Fetching}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
+ *   | {type: 'placed', scene: number}
  *   | {type: 'pause', isPaused: boolean}
  *   | {type: 'rewrite', up: number[], port: MessagePort}
  *   | {type: 'stop'}} Request
@@ -54,6 +55,9 @@ import { TexelStream } from './texel_stream.mjs';
  * here for the first time.
  */
 
+/** Parts on their way to the page beyond which no others are decoded. */
+const UNPLACED = 8;
+
 /** Minimum interval between sorts while tiles arrive. */
 const SORT_INTERVAL_MS = 100;
 
@@ -82,6 +86,8 @@ class Job {
     this.shown = null;
     this.isDone = false; // everything that a view requires was here once
     this.isPaused = false;
+    this.unplaced = 0; // parts that the page has not received
+    this.resume = () => {};
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorts = true;
@@ -104,7 +110,9 @@ class Job {
       this.stream?.tiles.pause(this.isPaused);
     } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
     else if (request.type === 'stop') this.reset();
-    else if (this.spare.length < 2) this.spare.push(request.order);
+    else if (request.type === 'placed') {
+      if (request.scene === this.scene && --this.unplaced < UNPLACED) this.resume();
+    } else if (this.spare.length < 2) this.spare.push(request.order);
   }
 
   /** Close the scene. */
@@ -116,6 +124,7 @@ class Job {
     this.drawn = [];
     this.shown = null;
     this.isDone = false;
+    this.unplaced = 0;
     this.spare = [];
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     this.sorter = new DepthSorter();
@@ -148,6 +157,11 @@ class Job {
     }
   }
 
+  /** Resolves when the page has received most of what was sent, after another part. */
+  async room() {
+    if (++this.unplaced >= UNPLACED) await new Promise((/** @type {(value: void) => void} */ go) => (this.resume = go));
+  }
+
   /**
    * Send the scene's file with another up direction.
    *
@@ -175,6 +189,7 @@ class Job {
         if (texels.more) transfer.push(texels.more.buffer);
         post({ type: 'geometry', tile, slot, texels, samples }, transfer);
         this.sortSoon(SORT_INTERVAL_MS);
+        return this.room();
       },
       evict: (tile) => {
         if (this.drawn.some(({ index }) => index === tile)) this.sort(); // its slots are given to another
@@ -187,6 +202,7 @@ class Job {
           { type: 'band', tile, layer, band },
           arrays.map(({ buffer }) => buffer),
         );
+        return this.room();
       },
       progress: ({ decodeMs, ...progress }) => post({ type: 'progress', progress, decodeMs }),
       warn: (error) => post({ type: 'error', error: reportOf(error, false) }),

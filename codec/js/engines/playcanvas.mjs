@@ -4,7 +4,7 @@
 
 import * as pc from 'playcanvas';
 
-import { FADE_STEPS } from '../levels/shown_tiles.mjs';
+import { FADE_EXCESS, FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
 import { openScene } from './scene.mjs';
@@ -31,7 +31,7 @@ uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whe
 uniform vec4 csOther; // lowest integer and step of colours, lowest integer and unit of quats
 uniform vec4 csLows;  // lowest integers of SH bands; whether splats are discs
 uniform vec4 csSteps;
-uniform float csFade; // share of the optical depth
+uniform float csFade; // share that is drawn, see fadedAlpha
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 vec3 getCenter() {
   uvec4 mean = loadCsMeans();
@@ -56,7 +56,7 @@ vec3 getScale() {
 vec4 getColor() {
   float alpha = float(loadCsShapes().w) / csShape.z;
   if (csShape.w > 0.5) alpha *= alpha;
-  if (csFade < 1.0) alpha = 1.0 - pow(1.0 - min(alpha, 0.99), csFade);
+  alpha *= csFade * (1.0 + ${FADE_EXCESS} * alpha * (1.0 - csFade));
   return vec4(0.5 + 0.28209479177387814 * (vec3(loadCsColours().xyz) + csOther.x) * csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -109,7 +109,7 @@ fn getScale() -> vec3f {
 fn getColor() -> vec4f {
   var alpha = f32(loadCsShapes().w) / uniform.csShape.z;
   if (uniform.csShape.w > 0.5) { alpha *= alpha; }
-  if (uniform.csFade < 1.0) { alpha = 1.0 - pow(1.0 - min(alpha, 0.99), uniform.csFade); }
+  alpha *= uniform.csFade * (1.0 + ${FADE_EXCESS} * alpha * (1.0 - uniform.csFade));
   return vec4f(0.5 + 0.28209479177387814 * (vec3f(loadCsColours().xyz) + uniform.csOther.x) * uniform.csOther.y, alpha);
 }
 #if SH_BANDS > 0

@@ -3,23 +3,25 @@
 
 import { chooseTiles } from './level_cut.mjs';
 
-/** Steps of a fade: at step k, new tiles are drawn with k shares of their optical depth, old ones with the others. */
+/** Steps of a fade: at step k, new tiles are drawn with k shares of their opacity, old ones with the others. */
 export const FADE_STEPS = 8;
 
 /** Time between steps, milliseconds. Where drawing takes longer, steps are left out. */
 export const STEP_MS = 40;
 
-const OPACITY_MAX = 0.99; // that splats are drawn with
+/** Makes two versions of an opaque splat, of shares that add up to one, together as opaque as one, averaged over its area. */
+export const FADE_EXCESS = 0.34;
 
 /**
- * Return the opacity of a splat that fades. Shares of optical depth, since two versions of the same surface are then as opaque
- * together as each is alone.
+ * Return the opacity of a splat that fades.
  *
  * @param {number} alpha
- * @param {number} shares 1 to FADE_STEPS
+ * @param {number} shares 0 to FADE_STEPS
  */
-export const fadedAlpha = (alpha, shares) =>
-  shares === FADE_STEPS ? alpha : 1 - (1 - Math.min(alpha, OPACITY_MAX)) ** (shares / FADE_STEPS);
+export function fadedAlpha(alpha, shares) {
+  const share = shares / FADE_STEPS;
+  return alpha * share * (1 + FADE_EXCESS * alpha * (1 - share));
+}
 
 /** The tiles of a scene that are drawn. */
 export class ShownTiles {

@@ -8,6 +8,7 @@ import { CsplatReader } from '../decoder.mjs';
 import { openScene } from '../engines/scene.mjs';
 import { FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { SplatPool, poolSize } from '../levels/splat_pool.mjs';
+import { BATCHES, BATCH_BYTES, TileStream } from '../levels/tile_stream.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { serve, vector } from './helpers.mjs';
 
@@ -120,6 +121,40 @@ test('a budget bounds the splats that are drawn, and the pool and memory with it
     const kept = [...levels.loaded.values()].reduce((sum, { count }) => sum + count, 0);
     assert.ok(kept <= Math.ceil((2 * levels.stream.budget) / 0.9));
   }
+});
+
+test('requests and decoded parts wait for those before them, so that a bound in bytes holds', async () => {
+  const count = 300;
+  const size = 90_000; // bytes of a part
+  const tile = (index) => ({
+    ...{ index, level: 0, splatCount: 1000, min: [index, 0, 0], max: [index + 1, 1, 1] },
+    layers: [0, 1].map((layer) => ({ layer, size, offset: size * (2 * index + layer) })),
+  });
+  const header = { tiles: Array.from({ length: count }, (_, index) => tile(index)), coarseTiles: [], shDegree: 1 };
+  let [requested, taken, decoding, placed] = [0, 0, 0, 0];
+  const prefetch = (layers) => {
+    requested += size * layers.length;
+    assert.ok(requested - taken <= BATCHES * (BATCH_BYTES + size), `${requested - taken} bytes`);
+  };
+  const reader = { header, prefetch, forget: () => {}, waitedMs: 0, arrivesInOrder: false };
+  const aims = { budget: Infinity, pixels: 0, around: true };
+  const stream = await TileStream.open(reader, aims, new AbortController().signal, { lanes: 2 });
+  const place = async () => {
+    placed++;
+    await new Promise((resolve) => setTimeout(resolve, placed % 7 ? 0 : 5));
+    decoding--;
+    taken += size;
+  };
+  await new Promise((complete, reject) => {
+    stream.failed.catch(reject);
+    const decode = async () => {
+      assert.ok(++decoding <= 2);
+      return {};
+    };
+    stream.sink = { decode, geometry: place, band: place, evict: reject, warn: reject, progress: () => {}, complete };
+    stream.setView(null);
+  });
+  assert.deepEqual([placed, taken], [2 * count, requested]);
 });
 
 test('workers read the same layers, and no byte is requested twice', async (t) => {
