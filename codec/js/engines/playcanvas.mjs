@@ -30,8 +30,7 @@ const GLSL = /* glsl */ `
 uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whether alpha is squared
 uniform vec4 csOther; // lowest integer and step of colours, lowest integer and unit of quats
 uniform vec4 csLows;  // lowest integers of SH bands; whether splats are discs
-uniform vec4 csSteps;
-uniform float csFade; // share that is drawn, see fadedAlpha
+uniform vec4 csSteps; // of these; share that is not drawn, see fadedAlpha
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 vec3 getCenter() {
   uvec4 mean = loadCsMeans();
@@ -56,7 +55,7 @@ vec3 getScale() {
 vec4 getColor() {
   float alpha = float(loadCsShapes().w) / csShape.z;
   if (csShape.w > 0.5) alpha *= alpha;
-  alpha *= csFade * (1.0 + ${FADE_EXCESS} * alpha * (1.0 - csFade));
+  alpha *= (1.0 - csSteps.w) * (1.0 + ${FADE_EXCESS} * alpha * csSteps.w);
   return vec4(0.5 + 0.28209479177387814 * (vec3(loadCsColours().xyz) + csOther.x) * csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -84,7 +83,6 @@ uniform csShape: vec4f;
 uniform csOther: vec4f;
 uniform csLows: vec4f;
 uniform csSteps: vec4f;
-uniform csFade: f32;
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 fn getCenter() -> vec3f {
   let mean = loadCsMeans();
@@ -109,7 +107,7 @@ fn getScale() -> vec3f {
 fn getColor() -> vec4f {
   var alpha = f32(loadCsShapes().w) / uniform.csShape.z;
   if (uniform.csShape.w > 0.5) { alpha *= alpha; }
-  alpha *= uniform.csFade * (1.0 + ${FADE_EXCESS} * alpha * (1.0 - uniform.csFade));
+  alpha *= (1.0 - uniform.csSteps.w) * (1.0 + ${FADE_EXCESS} * alpha * uniform.csSteps.w);
   return vec4f(0.5 + 0.28209479177387814 * (vec3f(loadCsColours().xyz) + uniform.csOther.x) * uniform.csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -153,15 +151,17 @@ class CsplatResource extends pc.GSplatResourceBase {
     this.entities = new Set();
     /** @type {import('./options.d.ts').SceneFacts | null} */
     this.csplat = null;
+    /** Parameters of the shaders, of which the last fades. @type {number[]} */
+    this.steps = [0, 0, 0, 0];
     /** What draws levels of detail. @type {TileEntities | null} */
     this.tiles = null;
     this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
-    this.add(images, { ...parameters, csFade: 1 }, 0);
+    this.add(images, parameters, 0);
   }
 
   /**
    * @param {Record<string, Image>} images
-   * @param {Record<string, number | number[]>} parameters
+   * @param {Record<string, number[]>} parameters
    * @param {number} degree SH degree now available
    */
   add(images, parameters, degree) {
@@ -173,7 +173,15 @@ class CsplatResource extends pc.GSplatResourceBase {
     }
     this.gsplatData.shBands = degree;
     this._format = new pc.GSplatFormat(device, this.described, { readGLSL: GLSL, readWGSL: WGSL });
+    const hidden = this.steps[3];
     for (const [name, value] of Object.entries(parameters)) this.parameters.set(name, value);
+    this.steps = /** @type {number[]} */ (this.parameters.get('csSteps'));
+    this.steps[3] = hidden;
+  }
+
+  /** @param {number} shares that are drawn */
+  fade(shares) {
+    this.steps[3] = 1 - shares / FADE_STEPS; // the engine's materials refer to this array
   }
 
   /** Add the SH bands of a progressive load. */
@@ -283,7 +291,7 @@ class TileEntities {
    */
   fade(index, shares) {
     const one = this.shown.get(index);
-    one?.resource.parameters.set('csFade', shares / FADE_STEPS);
+    one?.resource.fade(shares);
     for (const { gsplat } of one?.children.values() ?? [])
       if (gsplat) gsplat.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
   }
