@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Levels of detail in engines: what is drawn for a camera, and the pool of splats that it is drawn from. Also: tile_stream,
-// splat_pool, shown_tiles.
+// splat_pool.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
