@@ -443,8 +443,9 @@ class SplatEngine {
       this.tell({ type: 'stop' });
       this.fail(error);
     }
+    if (reply.type === 'geometry' || reply.type === 'band') this.tell({ type: 'placed', scene: reply.scene });
     if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
-    if (['header', 'band', 'cut', 'order', 'done'].includes(reply.type)) this.requestFrame();
+    if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
     this.wake();
   }
 

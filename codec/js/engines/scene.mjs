@@ -155,7 +155,7 @@ export class SplatScene {
       return { ...tile, index, first };
     });
     /** The header of a file with this version alone, or with room for what is streamed. */
-    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels) : splatCount };
+    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels.stream) : splatCount };
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;

@@ -14,12 +14,13 @@ import { Ranges } from './ranges.mjs';
  * @typedef {import('../reader.mjs').Reader} Reader
  * @typedef {import('./level_cut.mjs').View} View
  *
- * Receives what was read. `decode` reads a layer as the decoder's form 'packed'; `geometry` and `band` take the result.
+ * Receives what was read. `decode` reads a layer as the decoder's form 'packed'; `geometry` and `band` take the result, and may
+ * return a promise to wait for before the next one is decoded.
  *
  * @typedef {object} Sink
  * @property {(tile: TileRecord, layer: number, signal: AbortSignal) => Promise<any>} decode
- * @property {(tile: TileRecord, packed: any, slot: number) => void} geometry
- * @property {(tile: TileRecord, layer: number, packed: any) => void} band
+ * @property {(tile: TileRecord, packed: any, slot: number) => void | Promise<void>} geometry
+ * @property {(tile: TileRecord, layer: number, packed: any) => void | Promise<void>} band
  * @property {(index: number) => void} evict the tile is no longer here
  * @property {(place: LayerRecord | null) => void} progress a part was read; null: everything that a view requires is here
  * @property {(error: unknown) => void} warn reports an error that leaves the scene usable: a damaged tile, for which a
@@ -45,9 +46,12 @@ import { Ranges } from './ranges.mjs';
  * @typedef {{tile: TileRecord, place: LayerRecord}} Part
  */
 
-/** Bytes that are requested together, and requests in flight; together about half a second at 10 Mbit/s. */
-const BATCH_BYTES = 1 << 18;
-const BATCHES = 3;
+/**
+ * Bytes that are requested together, and requests in flight; together about half a second at 10 Mbit/s. What is encoded in memory
+ * is at most their product, and one part for each request.
+ */
+export const BATCH_BYTES = 1 << 18;
+export const BATCHES = 3;
 
 /** Splats that are kept, as a multiple of those drawn: coarser versions, a third, and what was seen before. */
 const KEPT = 2;
@@ -94,7 +98,9 @@ export class TileStream {
     /** Tiles of the coarsest version. */
     this.roots = new Set(roots.flatMap(({ firstTile, tileCount }) => tilesOf(firstTile, tileCount)));
     this.hasLevels = this.roots.size < this.all.length;
-    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * Math.max(aims.budget, this.rootSplats) : Infinity);
+    /** Number of splats that are drawn at most, unless the coarsest version has more. */
+    this.budget = Math.max(aims.budget, this.rootSplats);
+    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * this.budget : Infinity);
     this.slots = new Ranges(this.memory.pages);
     /** Tiles whose layer 0 is here, and their slots. @type {Map<number, number>} */
     this.here = new Map();
@@ -281,13 +287,14 @@ export class TileStream {
     const { layer } = place;
     const begun = performance.now() - reader.waitedMs;
     try {
-      if (layer === 0) this.#takeGeometry(tile, place, await sink.decode(tile, layer, signal));
-      else if (this.here.has(tile.index)) this.#takeBand(tile, place, await sink.decode(tile, layer, signal));
+      if (layer > 0 && !this.here.has(tile.index)) return;
+      const packed = await sink.decode(tile, layer, signal);
+      amounts.decodeMs += performance.now() - reader.waitedMs - begun;
+      await (layer === 0 ? this.#takeGeometry(tile, place, packed) : this.#takeBand(tile, place, packed));
     } catch (error) {
       if (!signal.aborted) this.#refuse(tile, error);
       return;
     }
-    amounts.decodeMs += performance.now() - reader.waitedMs - begun;
     amounts.layer = layer;
     sink.progress(place);
   }
@@ -312,11 +319,14 @@ export class TileStream {
    */
   #takeGeometry(tile, place, packed) {
     const slot = this.#room(tile);
-    if (slot === null) return void this.crowded.add(tile.index);
+    if (slot === null) {
+      this.crowded.add(tile.index);
+      return;
+    }
     this.here.set(tile.index, slot);
     this.read.add(place);
     if (tile.level === 0) this.amounts.splatsDone += tile.splatCount;
-    this.sink.geometry(tile, packed, slot);
+    return this.sink.geometry(tile, packed, slot);
   }
 
   /**
@@ -329,7 +339,7 @@ export class TileStream {
     this.read.add(place);
     const isWhole = tile.layers.every((one) => one.layer > this.reader.header.shDegree || this.read.has(one));
     if (isWhole) this.reader.forget(tile.index);
-    this.sink.band(tile, place.layer, packed);
+    return this.sink.band(tile, place.layer, packed);
   }
 
   /**
