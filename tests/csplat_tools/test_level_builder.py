@@ -429,6 +429,8 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
         (4096, "auto"): None,
         (4097, "auto"): FittedLevelBuilder(),
         (9, 2): FittedLevelBuilder(2),
+        (2_000_001, "auto"): FittedLevelBuilder(leaf_splats=1 << 15),
+        (40_000_001, "auto"): FittedLevelBuilder(),
         (4096, "merged"): None,
         (4097, "merged"): FittedLevelBuilder(fits=False),
     }

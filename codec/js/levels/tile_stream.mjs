@@ -47,11 +47,16 @@ import { Ranges } from './ranges.mjs';
  */
 
 /**
- * Bytes that are requested together, and requests in flight; together about half a second at 10 Mbit/s. What is encoded in memory
- * is at most their product, and one part for each request.
+/**
+ * Least and largest number of bytes that are requested together. It begins with the least, doubles when a batch is here in less
+ * than `BATCH_MS`, and is halved when a batch takes longer than four times that. What is encoded in memory is at most the
+ * largest times `BATCHES`, and one part for each request.
  */
-export const BATCH_BYTES = 1 << 18;
-export const BATCHES = 3;
+export const BATCH_BYTES = [1 << 15, 1 << 20];
+const BATCH_MS = 250;
+
+/** Batches in flight, to not wait between them; of the least number of bytes, one alone, so that nothing else delays it. */
+export const BATCHES = 2;
 
 /** Splats that are kept, as a multiple of those drawn: coarser versions, a third, and what was seen before. */
 const KEPT = 2;
@@ -114,8 +119,9 @@ export class TileStream {
     this.choices = 0;
     /** Parts in flight. @type {Map<LayerRecord, AbortController>} */
     this.pending = new Map();
-    /** Number of parts in flight by request. @type {Map<AbortController, number>} */
+    /** Number of parts in flight by batch, and when it was requested. @type {Map<AbortController, {left: number, begun: number}>} */
     this.batches = new Map();
+    this.batchBytes = BATCH_BYTES[0];
     /** Parts to decode, in this order. @type {Part[]} */
     this.queue = [];
     this.freeLanes = lanes;
@@ -198,9 +204,9 @@ export class TileStream {
       const isNext = place.layer === layer && (!isFirst || this.roots.has(tile.index));
       return isNext && !this.pending.has(place);
     });
-    while (this.batches.size < BATCHES && left.length > 0) {
+    while (this.batches.size < (this.batchBytes > BATCH_BYTES[0] ? BATCHES : 1) && left.length > 0) {
       let [bytes, count] = [0, 0];
-      while (count < left.length && bytes < BATCH_BYTES) bytes += left[count++].place.size;
+      while (count < left.length && bytes < this.batchBytes) bytes += left[count++].place.size;
       this.#request(left.splice(0, count));
     }
   }
@@ -251,7 +257,7 @@ export class TileStream {
   /** @param {Part[]} parts */
   #request(parts) {
     const controller = new AbortController();
-    this.batches.set(controller, parts.length);
+    this.batches.set(controller, { left: parts.length, begun: performance.now() });
     for (const { place } of parts) this.pending.set(place, controller);
     const layers = parts.map(({ tile, place }) => ({ tile: tile.index, layer: place.layer }));
     this.reader.prefetch(layers, { signal: controller.signal });
@@ -269,13 +275,19 @@ export class TileStream {
       if (!controller.signal.aborted) await this.#readPart(part, controller.signal);
       this.pending.delete(part.place);
       await nextTask(); // lets the camera's messages in
-      const left = /** @type {number} */ (this.batches.get(controller)) - 1;
-      this.batches.set(controller, left);
-      if (left > 0) continue;
+      const batch = /** @type {{left: number, begun: number}} */ (this.batches.get(controller));
+      if (--batch.left > 0) continue;
       this.batches.delete(controller);
+      if (!controller.signal.aborted) this.#fitBatches(performance.now() - batch.begun);
       this.readOn();
     }
     this.freeLanes++;
+  }
+
+  /** @param {number} took time of a batch, milliseconds */
+  #fitBatches(took) {
+    const factor = took < BATCH_MS ? 2 : took > 4 * BATCH_MS ? 0.5 : 1;
+    this.batchBytes = Math.min(BATCH_BYTES[1], Math.max(BATCH_BYTES[0], factor * this.batchBytes));
   }
 
   /**

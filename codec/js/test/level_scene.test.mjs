@@ -134,7 +134,7 @@ test('requests and decoded parts wait for those before them, so that a bound in 
   let [requested, taken, decoding, placed] = [0, 0, 0, 0];
   const prefetch = (layers) => {
     requested += size * layers.length;
-    assert.ok(requested - taken <= BATCHES * (BATCH_BYTES + size), `${requested - taken} bytes`);
+    assert.ok(requested - taken <= BATCHES * (BATCH_BYTES[1] + size), `${requested - taken} bytes`);
   };
   const reader = { header, prefetch, forget: () => {}, waitedMs: 0, arrivesInOrder: false };
   const aims = { budget: Infinity, pixels: 0, around: true };
