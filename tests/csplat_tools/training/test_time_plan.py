@@ -43,7 +43,9 @@ def test_more_time_gives_a_better_training_within_the_time():
 
 
 def test_large_images_are_scaled_down_and_slow_machines_train_less():
-    assert (500, 375) == chosen(600.0, unscaled=(4000, 3000)).size
+    plan = chosen(600.0, unscaled=(4000, 3000))
+    assert (1000, 750) == plan.size
+    assert plan.max_splats <= 0.5 * 1000 * 750
     slow = StepCost(*(20.0 * part for part in (COST.base, COST.per_pixel, COST.per_splat, COST.per_both)))
     fast, late = chosen(1800.0), chosen(1800.0, cost=slow)
     assert late.iterations < fast.iterations
@@ -55,7 +57,8 @@ def test_large_images_are_scaled_down_and_slow_machines_train_less():
 
 def test_given_settings_are_kept_and_numbers_are_short():
     assert 12_345 == chosen(600.0, max_splats=12_345).max_splats
-    assert 2_345 == chosen(600.0, most_splats=2_345).max_splats  # those that a size holds
+    assert 2_000 == chosen(600.0, most_splats=2_345).max_splats  # those that a size holds
+    assert 345 == chosen(600.0, most_splats=345).max_splats
     plan = chosen(777.0)
     assert all(len(str(number).rstrip("0")) <= 2 for number in (plan.max_splats, plan.iterations))
     assert (

@@ -28,12 +28,8 @@ def train(
     context: typer.Context,
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed images.")],
     output: Annotated[str, typer.Argument(metavar="OUT", help="OUT.ply; or OUT.csplat, which is tuned as well.")],
-    time: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Time for everything, e.g. 30min. Default: 1h.")
-    ] = None,
-    max_splats: Annotated[
-        int | None, typer.Option(metavar="N", help="Largest number of splats. Default: by the time.")
-    ] = None,
+    time: Annotated[str | None, typer.Option(metavar="TIME", help="Time for all, e.g. 30min. Default: 1h.")] = None,
+    max_splats: Annotated[int | None, typer.Option(metavar="N", help="Most splats. Default: by --time.")] = None,
     sh_degree: Annotated[
         int, typer.Option(metavar="0..4", show_default=False, help="SH degree of colours. Default: 3.")
     ] = _DEFAULT.sh_degree,
@@ -45,7 +41,7 @@ def train(
     target_size: shared.TargetSize = None,
     target_psnr: shared.TargetPsnr = None,
     device: Annotated[
-        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, cuda, torch: slow. Default: cpu.")
+        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu; cuda: a GPU; torch. Default: cpu.")
     ] = "cpu",
     preview: Annotated[
         str | None, typer.Option(metavar="FILE.png", help="Image and render, renewed meanwhile.")
@@ -53,7 +49,7 @@ def train(
     page: shared.Page = None,
     up: shared.HiddenUp = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images, pixels. Default: by the time.")
+        str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images. Default: by --time.")
     ] = None,
     test_every: shared.TestEvery = None,
     background: Annotated[

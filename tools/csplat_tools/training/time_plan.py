@@ -28,15 +28,16 @@ _PIXELS = (1 << 16, 1 << 20)  # largest numbers of pixels at which steps are tim
 _SCALES = (1.0, 0.5, 0.25, 0.125)  # candidates for the size of images, as factors of width and height
 _LEAST_SIDE = 100  # pixels of images that are scaled down, at least
 _DIGITS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # leading digits of candidates for the number of splats
-_LEAST_SPLATS, _MOST_SPLATS = 1_000, 2_000_000
+_MOST_SPLATS = 2_000_000
 _LEAST_STEPS, _MOST_STEPS = 100, 30_000  # INRIA's trainings have 30,000 steps
 _ASPECT = 0.02  # largest relative difference of aspect ratios of images that are scaled to one size
 
-_PIXELS_PER_SPLAT = 128  # pixels of all training images for which there is a splat, at most
+_PIXELS_PER_SPLAT = 200  # pixels of all unscaled training images for which there is a splat, at most
+_DENSEST = 0.5  # splats per pixel of a scaled image, at most; smaller details are not in the images
 # Fits to trainings on a CPU: fox with 10,000 splats in 2,000 and 6,000 steps (22.9, 25.3 dB) and with 60,000 (30.2 dB),
 # Lego at 200×200 with 1,000 to 20,000 splats, and at 800×800 (`csplat_bench run photographs`).
 _STEPS_LOSS = 8_000.0  # dB, divided by the number of steps
-_SPLATS_LOSS = 1.5  # dB at the largest number of splats; grows with the root of how many times fewer there are
+_SPLATS_LOSS = 1.9  # dB at the largest number of splats; grows with the root of how many times fewer there are
 _PIXELS_LOSS = 0.5  # dB for each halving of the pixels
 
 
@@ -57,7 +58,7 @@ class StepCost:
     def of(cls, times: Mapping[tuple[int, int], float]) -> StepCost:
         """Return the cost from the times of four steps, seconds by (pixels, splats): few and many of either."""
         (low, few), (high, many) = min(times), max(times)
-        by_few, by_many = ((times[high, n] - times[low, n]) / (high - low) for n in (few, many))
+        by_few, by_many = ((times[high, n] - times[low, n]) / max(1, high - low) for n in (few, many))
         both = max(0.0, (by_many - by_few) / (many - few))
         per_pixel = max(0.0, by_few - both * few)
         per_splat = max(0.0, (times[low, many] - times[low, few]) / (many - few) - both * low)
@@ -176,7 +177,8 @@ def choose_settings(
     best, least_loss = None, math.inf
     for size in sizes:
         width, height = size or unscaled
-        for count in _splat_counts(suitable, most_splats) if max_splats is None else [max_splats]:
+        limit = min(suitable, _DENSEST * width * height, most_splats or math.inf)
+        for count in _splat_counts(limit) if max_splats is None else [max_splats]:
             per_step = TRAINED * cost.seconds(width * height, count) * (1.0 + _FILE * to_file)
             steps = _rounded(min(_MOST_STEPS, max(_LEAST_STEPS, _STEPS_FRACTION * seconds / per_step)))
             expected = steps * per_step + (1.0 - _STEPS_FRACTION) * min(seconds, steps * per_step)
@@ -200,12 +202,10 @@ def expected_loss(pixels: float, splats: float, steps: float) -> float:
     return _STEPS_LOSS / steps + _SPLATS_LOSS / math.sqrt(splats) - _PIXELS_LOSS * math.log2(pixels)
 
 
-def _splat_counts(suitable: float, most: int | None) -> list[int]:
-    """Return the candidates for the number of splats, ascending; the last is `most` if that limits them."""
-    limit = suitable if most is None else min(suitable, most)
+def _splat_counts(limit: float) -> list[int]:
+    """Return the candidates for the number of splats up to a limit, ascending; the limit alone if that is small."""
     counts = [round(digit * 10**power) for power in range(3, 7) for digit in _DIGITS]
-    counts = [count for count in counts if _LEAST_SPLATS <= count <= limit]
-    return [*counts, most] if most is not None and most < suitable else counts or [max(1, round(limit))]
+    return [count for count in counts if count <= limit] or [max(1, int(limit))]
 
 
 def _rounded(steps: float) -> int:
