@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,9 @@ from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
 _BACKGROUNDS = ", ".join(BACKGROUNDS)
+if TYPE_CHECKING:
+    from csplat_tools.training.time_plan import TrainingSettings
+
 _HOUR = 3600.0  # seconds, the default of --time
 
 
@@ -99,7 +102,7 @@ def train(
     target, overrides = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep), shared.parse_overrides(up)
     pixels = None if size is None else shared.parse_size(size)
     require_trainer(plots=page is not None)
-    from csplat_tools.training.time_plan import plan_in_time
+    from csplat_tools.training.time_plan import TrainingSettings, plan_in_time
     from csplat_tools.training.training_run import (
         explain_size,
         plan_training,
@@ -116,7 +119,7 @@ def train(
     processor = {"device": "cpu", "engine": "torch"} if device == "torch" else {"device": device}
     options = shared.checked(
         TrainOptions, sh_degree=sh_degree, seed=seed, background=background, **processor,
-        max_splats=TrainOptions.max_splats if max_splats is None else max_splats,
+        max_splats=(splats_for(target) or TrainOptions.max_splats) if max_splats is None else max_splats,
         iterations=TrainOptions.iterations if iterations is None else iterations,
     )  # fmt: skip
     replaces = shared.is_same_file(checkpoint, resume)
@@ -127,23 +130,20 @@ def train(
         check_name(output, ".ply", "train", source)
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
     data = shared.open_data(source, size=pixels, test_every=test_every)
+    settings = TrainingSettings(pixels, options.max_splats, options.iterations)
     if resume is not None:
-        known = stored_settings(resume)
-        data = replace(data, size=known.size if pixels is None else pixels)
-        max_splats = known.max_splats if max_splats is None else max_splats
-        options = replace(options, iterations=known.iterations if iterations is None else iterations)
+        settings = stored_settings(resume, size=pixels, max_splats=max_splats, iterations=iterations)
     elif iterations is None:
         with out.bar() as progress:
             settings = plan_in_time(
                 data, options, seconds, to_file=to_file, max_splats=max_splats, most_splats=splats_for(target),
                 context=Context(seed=seed, progress=progress),
             )  # fmt: skip
-        data, max_splats = replace(data, size=settings.size), settings.max_splats
-        options = replace(options, iterations=settings.iterations)
         out.remark(*_describe_plan(settings, seconds, context))
-    options = replace(options, max_splats=options.max_splats if max_splats is None else max_splats)
+    data = replace(data, size=settings.size)
+    options = replace(options, max_splats=settings.max_splats, iterations=settings.iterations)
     if to_file:
-        options = plan_training(options, target, max_splats=max_splats)
+        options = plan_training(options, target, max_splats=settings.max_splats)
     kept = shared.run_checkpoint(checkpoint, resume, output, lambda path: [tuning_checkpoint(path)])
     with kept as path, out.bar() as progress:
         files, run = Outputs(path, preview=preview, resume=resume), Context(seed=seed, progress=progress)
@@ -161,8 +161,8 @@ def train(
     out.publish(result)
 
 
-def _describe_plan(settings: Any, seconds: float, context: typer.Context) -> list[str]:
-    """Return lines on the settings of a timed training, `TimedSettings`, and the command that repeats it."""
+def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Context) -> list[str]:
+    """Return lines on the settings of a timed training, and the command that repeats it."""
     size = "" if settings.size is None else ", images of {}×{} pixels".format(*settings.size)
     text = f"{settings.max_splats:,} splats, {settings.iterations:,} steps{size}"
     late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"

@@ -71,19 +71,19 @@ class StepCost:
 
 
 @dataclass(frozen=True)
-class TimedSettings:
-    """Settings of a training that fits in a given time.
+class TrainingSettings:
+    """Settings of a training that depend on its time.
 
     Attributes:
         size: width and height that images are scaled to; `None`: unscaled.
         max_splats, iterations: as in `TrainOptions`.
-        seconds: expected time of the whole run.
+        seconds: expected time of the whole run; 0: unknown.
     """
 
     size: tuple[int, int] | None
     max_splats: int
     iterations: int
-    seconds: float
+    seconds: float = 0.0
 
 
 def plan_in_time(
@@ -95,7 +95,7 @@ def plan_in_time(
     max_splats: int | None = None,
     most_splats: int | None = None,
     context: Context = DEFAULT_CONTEXT,
-) -> TimedSettings:
+) -> TrainingSettings:
     """Choose the settings of a training by timing a few steps, which takes seconds.
 
     Args:
@@ -161,7 +161,7 @@ def choose_settings(
     to_file: bool,
     max_splats: int | None = None,
     most_splats: int | None = None,
-) -> TimedSettings:
+) -> TrainingSettings:
     """Return the settings of the best expected quality that fit in a time.
 
     Args:
@@ -186,7 +186,7 @@ def choose_settings(
             if steps == _LEAST_STEPS:  # the time may be too short: the fastest is the best
                 loss = 100.0 + expected
             if loss < least_loss:
-                best, least_loss = TimedSettings(size, count, steps, expected), loss
+                best, least_loss = TrainingSettings(size, count, steps, expected), loss
     assert best is not None
     return best
 

@@ -18,7 +18,7 @@ from csplat_render.lpips import load_lpips
 from csplat_tools.console import format_bytes, note, step_progress
 from csplat_tools.file_streams import write_model
 from csplat_tools.scene_files import MetadataOverrides
-from csplat_tools.training.time_plan import TimedSettings, expected_seconds
+from csplat_tools.training.time_plan import TrainingSettings, expected_seconds
 from csplat_tools.training.tuning_report import describe_step, show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, paced, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
@@ -173,17 +173,25 @@ def plan_training(
     return replace(options, max_splats=max_splats, final_share=share)
 
 
-def stored_settings(checkpoint: str | Path) -> TimedSettings:
-    """Return the settings of the training that a checkpoint is of; its expected time is unknown, 0.
+def stored_settings(
+    checkpoint: str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    max_splats: int | None = None,
+    iterations: int | None = None,
+) -> TrainingSettings:
+    """Return the settings of the training that a checkpoint is of, or those that are given instead.
 
     Raises:
         InputError: the checkpoint is damaged.
     """
     stored = load_checkpoint(checkpoint)
-    size, count, steps = stored.own.get("size"), stored.options.get("max_splats"), stored.options.get("iterations")
+    known, count, steps = (stored.own.get("size"), *map(stored.options.get, ("max_splats", "iterations")))
     if not isinstance(count, int) or not isinstance(steps, int):
         raise InputError(f"{checkpoint} lacks the options of its training, expected max_splats and iterations")
-    return TimedSettings(None if size is None else (size[0], size[1]), count, steps, 0.0)
+    if size is None and isinstance(known, list) and len(known) == 2 and all(isinstance(side, int) for side in known):
+        size = known[0], known[1]
+    return TrainingSettings(size, max_splats or count, iterations or steps)
 
 
 def explain_size(result: Mapping[str, Any], target: Target | None) -> list[str]:
