@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -48,7 +47,8 @@ _STEPS_BETWEEN = 100  # steps after each late pruning, or 1 % of the iterations
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
 _EXPONENT_MAX = 700.0  # largest exponent whose exponential fits float64
 _DOUBLING = 2.0  # growth of a resumed scene with too few splats, until it has enough
-_TIMED_IMAGES, _TIMED_STEPS = 4, 3  # images of timed steps, and their number after the first
+_TIMED_IMAGES = 4  # images of timed steps
+_TIMED_STEPS, _TIMED_SECONDS = (3, 50), 1.0  # least and largest number of timed steps, and their least time otherwise
 _FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
 
@@ -95,7 +95,7 @@ def train(
 
 
 def time_step(data: DataSet, options: TrainOptions, splat_count: int, *, context: Context = DEFAULT_CONTEXT) -> float:
-    """Return the time of a training step of initial splats at the full SH degree, seconds: the median of a few.
+    """Return the time of a training step of initial splats at the full SH degree, seconds: the mean of a few.
 
     Args:
         data: the data set, of which only a few images are read.
@@ -109,14 +109,15 @@ def time_step(data: DataSet, options: TrainOptions, splat_count: int, *, context
     images = data.inliers
     few = replace(data, train=images[:: -(-len(images) // _TIMED_IMAGES)], test=[], val=[])
     options = replace(options, max_splats=splat_count, initial_splats=splat_count)
-    seconds = []
     with thread_count(context.threads):
         training = _Training(few, options, Outputs(), lambda _: None, context)
-        for step in range(_TIMED_STEPS + 1):
-            begin = time.perf_counter()
-            training.time_step(step % len(few.train))
-            seconds.append(time.perf_counter() - begin)
-    return median(seconds[1:])  # the first allocates
+        training.time_step(0)  # allocates
+        begin, seconds, count = time.perf_counter(), 0.0, 0
+        while count < _TIMED_STEPS[0] or (count < _TIMED_STEPS[1] and seconds < _TIMED_SECONDS):
+            count += 1
+            training.time_step(count % len(few.train))
+            seconds = time.perf_counter() - begin
+    return seconds / count
 
 
 class _Training:

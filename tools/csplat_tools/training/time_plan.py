@@ -8,6 +8,7 @@ settings that follow are ordinary options, which give the same file at any later
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -96,7 +97,7 @@ def plan_in_time(
     most_splats: int | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> TrainingSettings:
-    """Choose the settings of a training by timing a few steps, which takes seconds.
+    """Choose the settings of a training by timing a few steps, which takes seconds of the time.
 
     Args:
         data: the data set; its size, if it has one, is not changed.
@@ -115,10 +116,10 @@ def plan_in_time(
         every = 8 if data.test_every is None else data.test_every
         return load(data.path, size, images=data.images, test_every=every, near=data.near, trust_paths=data.trust_paths)
 
-    whole = opened(data.size)
+    begin, whole = time.monotonic(), opened(data.size)
     sizes = [data.size] if data.size is not None else candidate_sizes(_sizes_of(whole))
     width, height = _sizes_of(whole)[0]
-    times = {}
+    times: dict[tuple[int, int], float] = {}
     for limit in _PIXELS:
         scale = min(1.0, math.sqrt(limit / (width * height)))
         if limit == _PIXELS[0]:
@@ -126,9 +127,12 @@ def plan_in_time(
         size = max(1, round(scale * width)), max(1, round(scale * height))
         images = opened(size)
         for count in _SPLATS:
+            context.progress("timing steps", len(times) / 4)
             times[size[0] * size[1], count] = time_step(images, options, count, context=context)
+    context.progress("timing steps", 1.0)
+    left = max(0.5 * seconds, seconds - (time.monotonic() - begin))
     return choose_settings(
-        StepCost.of(times), seconds, sizes, (width, height), len(whole.train), to_file=to_file, max_splats=max_splats,
+        StepCost.of(times), left, sizes, (width, height), len(whole.train), to_file=to_file, max_splats=max_splats,
         most_splats=most_splats,
     )  # fmt: skip
 

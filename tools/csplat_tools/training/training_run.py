@@ -268,7 +268,9 @@ def _train(
     """
     for line in () if quiet else data_set.report:
         note(line)
+    context.progress("reading images", 0.0)
     data_set.read()  # to find damaged images before the first step
+    context.progress("reading images", 1.0)
     done = 0 if files.resume is None else load_checkpoint(files.resume).iteration
     is_long = not quiet and options.iterations - done >= _ANNOUNCED_FROM
     expected = expected_seconds(data_set, options, done, context) if is_long else None
