@@ -157,18 +157,18 @@ def encode_file(
                 "format": format, "strict": strict, "keep_extra": options.keep_extra, "sh_degree": read_degree(options),
                 "context": context,
             }  # fmt: skip
+            context.progress("reading", 0.0)
             if levels is None and (whole or _surely_fits(local, format, context)):
                 scene, builder = read_source(local, overrides, **reading), None
             else:
-                context.progress("opening", 0.0)
                 opened = stack.enter_context(csplat.open(local, format, sh_degree=read_degree(options)))
-                context.progress("opening", 1.0)
                 builder = choose_levels(opened.count, options, levels)
                 has_levels = opened.format == "sog" and len(opened.levels) > 1
                 if builder is not None and has_levels and not (target or importance):
                     builder, whole = _levels_of_source(local, builder, context), True
                 in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
                 scene = read_source(local, overrides, opened=opened, in_memory=in_memory, **reading)
+            context.progress("reading", 1.0)
         scene = with_first_view(scene, first_view, progress=context.progress)
         drops = target is None and options.kept_degree(scene.sh_degree) < scene.sh_degree
         try:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -45,6 +46,8 @@ _STEPS_BETWEEN = 100  # steps after each late pruning, or 1 % of the iterations
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
 _EXPONENT_MAX = 700.0  # largest exponent whose exponential fits float64
 _DOUBLING = 2.0  # growth of a resumed scene with too few splats, until it has enough
+_TIMED_IMAGES = 4  # images of timed steps
+_TIMED_STEPS, _TIMED_SECONDS = (3, 50), 1.0  # least and largest number of timed steps, and their least time otherwise
 _FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
 
@@ -64,7 +67,7 @@ def train(
     Args:
         data: a data set, or its path for `load`: a folder, or a `transforms.json`.
         options: options of the training.
-        outputs: checkpoints and previews.
+        outputs: checkpoints and a preview.
         on_step: called with the progress of the run, every `log_every` steps.
         context: threads and progress.
 
@@ -88,6 +91,32 @@ def train(
     images = data if isinstance(data, DataSet) else load(data)
     with thread_count(context.threads):
         return _Training(images, options or TrainOptions(), outputs or Outputs(), show, context).run()
+
+
+def time_step(data: DataSet, options: TrainOptions, splat_count: int, *, context: Context = DEFAULT_CONTEXT) -> float:
+    """Return the time of a training step of initial splats at the full SH degree, seconds: the mean of a few.
+
+    Args:
+        data: the data set, of which only a few images are read.
+        options: options of the training.
+        splat_count: number of splats.
+        context: threads.
+
+    Raises:
+        InputError: as for `train`.
+    """
+    images = data.inliers
+    few = replace(data, train=images[:: -(-len(images) // _TIMED_IMAGES)], test=[], val=[])
+    options = replace(options, max_splats=splat_count, initial_splats=splat_count)
+    with thread_count(context.threads):
+        training = _Training(few, options, Outputs(), lambda _: None, context)
+        training.time_step(0)  # allocates
+        begin, seconds, count = time.perf_counter(), 0.0, 0
+        while count < _TIMED_STEPS[0] or (count < _TIMED_STEPS[1] and seconds < _TIMED_SECONDS):
+            count += 1
+            training.time_step(count % len(few.train))
+            seconds = time.perf_counter() - begin
+    return seconds / count
 
 
 class _Training:
@@ -118,6 +147,7 @@ class _Training:
         self._log = self._fitter.log
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
+        self._next_preview = 0.0  # seconds of the run
         arrays: Mapping[str, NDArray[Any]] = {}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._place_splats(self._scene))
@@ -143,6 +173,11 @@ class _Training:
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
+    def time_step(self, view: int) -> None:
+        """Make a step on an image at the full SH degree, and wait for its end."""
+        self._fitter.iteration = self._options.iterations
+        self.step(view).read()
+
     def step(self, view: int) -> PendingLoss:
         fitter = self._fitter
         background = self._background
@@ -162,8 +197,9 @@ class _Training:
             self._report()
         if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
             self._evaluate(options.eval_views)
-        if outputs.preview_due(fitter.iteration, fitter.iterations):
-            self._preview()
+        if outputs.preview is not None and (fitter.is_last or fitter.seconds >= self._next_preview):
+            self._write_preview(outputs.preview)
+            self._next_preview = fitter.seconds + outputs.preview_seconds
 
     @property
     def _degree(self) -> int:
@@ -300,23 +336,19 @@ class _Training:
         self._log["evaluations"].append({"iteration": self._fitter.iteration, **metrics})
         return metrics
 
-    def _preview(self) -> None:
+    def _write_preview(self, path: str | Path) -> None:
         """Write the first test image, or training image if there are none, next to its render."""
-        assert self._outputs.previews is not None
-        folder = Path(self._outputs.previews)
-        folder.mkdir(parents=True, exist_ok=True)
         image = (self._data.test or self._data.train)[0]
         size = (image.camera.H, image.camera.W, 3)
         target = compose(image, self._background, np.empty(size, np.float32))
-        rendered = self._engine.render(image.camera, self._background, self._degree)
-        save_image(folder / f"{self._fitter.iteration:06d}.png", side_by_side(target, rendered))
+        save_image(path, side_by_side(target, self._engine.render(image.camera, self._background, self._degree)))
 
     def _save(self, path: str | Path) -> None:
         """Write a checkpoint."""
         screen = self._engine.screen
         self._fitter.save(
             path, "train", asdict(self._options), self._engine.parameters.on_cpu(),
-            own={"origin": self._data.origin}, arrays={} if screen is None else screen.state(),
+            own={"origin": self._data.origin, "size": self._data.size}, arrays={} if screen is None else screen.state(),
         )  # fmt: skip
 
     def _model(self) -> SplatModel:

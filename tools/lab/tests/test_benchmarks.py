@@ -492,6 +492,10 @@ name = "free"
 of = "few"
 command = "finetune {{ply}} {{file}} --data {{data}} --iterations 20 --lambda 0"
 without = "a rate term"
+[[cases]]
+name = "{{steps}} steps"
+each.steps = [20]
+command = "train {{data}} {{file}} --max-splats 30 --sh-degree 0 --iterations {{steps}} --size 12x8"
 [table]
 columns = [["file", "{{case}}"], ["dB", "{{psnr_mean:.2f}}"], ["series", "{{series}}"]]
 """
@@ -504,11 +508,12 @@ def test_files_of_photographs_are_trained_made_and_scored(tmp_path):
     status, found = run(tmp_path / "dots.toml", tmp_path)
     assert 0 == status
     rows = {row["case"]: row for row in found["rows"] if "published" not in row}
-    assert ["few", "more", "kept", "encoded", "free"] == list(rows)
+    assert ["few", "more", "kept", "encoded", "free", "20 steps"] == list(rows)
     work = tmp_path / "work" / "photographs"
     assert len(read_ply(work / "lego800-more.ply")) == rows["more"]["splats"] == rows["encoded"]["splats"]
     assert rows["kept"]["splats"] < rows["encoded"]["splats"]
     assert rows["free"]["size_bytes"] == (work / "lego800-free.csplat").stat().st_size
+    assert (30, 20, "12×8") == tuple(rows["20 steps"][name] for name in ("max_splats", "iterations", "images"))
     assert "csplat finetune, without a rate term" == rows["free"]["series"]
     assert all(row["psnr_mean"] > 5.0 and row["seconds"] > 0.0 for row in rows.values())
     assert {"HAC++", "MesonGS"} < {row["case"] for row in found["rows"] if "published" in row}
