@@ -89,7 +89,7 @@ def encode(
     levels: Levels = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> bytes | None:
-    """Encode a scene.
+    """Encode a scene. Its metadata are written as they are: `csplat_render.first_view` adds a first view for viewers.
 
     A scene that does not fit in memory is encoded on disk, if `out` is a path, with the same bytes: it is sorted into
     buckets of neighbours in a working folder, and these are coded one by one, by worker processes. If the encoding is

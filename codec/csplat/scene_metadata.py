@@ -31,6 +31,9 @@ TRAINING = _spec.META_KEY_TRAINING
 UP = _spec.META_KEY_UP
 VIEW = _spec.META_KEY_VIEW
 
+#: Values of the key `from` of a first view (spec 5.4): a training camera, chosen by a program, chosen by a person.
+TRAINED, ESTIMATE, AUTHOR = "training", "estimate", "author"
+
 #: Cosine of the angle between up directions that contradict each other; at larger angles another axis is closer to up.
 CONTRADICTS = math.cos(math.radians(45.0))
 
@@ -132,7 +135,8 @@ class SceneMetadata:
     def with_up(
         self, up: Direction | None = None, coordinate_system: str | None = None, *, estimated: bool = False
     ) -> SceneMetadata:
-        """Return the metadata with another up direction or other axes; entries that contradict them are removed.
+        """Return the metadata with another up direction or other axes; entries that contradict them are removed, and so
+        is an estimated first view, since the estimate depends on them.
 
         Args:
             up: three finite numbers, not all 0; `None`: unchanged. Without `coordinate_system`, existing axes with a
@@ -151,6 +155,9 @@ class SceneMetadata:
         if up is None and coordinate_system is None:
             return self
         entries = dict(self.entries)
+        view = entries.get(VIEW)
+        if isinstance(view, Mapping) and view.get("from") == ESTIMATE:
+            del entries[VIEW]
         estimates = [key for key in self.estimated if key != UP] + [UP] * (estimated and up is not None)
         entries.pop(ESTIMATED, None)
         entries |= {ESTIMATED: estimates} if estimates else {}

@@ -164,6 +164,46 @@ async function fetchBlob(url, way) {
   }
 }
 
+/** A range on its way, whose first bytes can be read before the others are here. */
+class ArrivingRange {
+  /**
+   * @param {{start: number, end: number, due: number}} range `due`: number of parts that have not been read
+   * @param {AbortSignal} [signal] cancels the request
+   */
+  constructor({ start, end, due }, signal) {
+    this.start = start;
+    this.end = end;
+    this.due = due;
+    this.signal = signal;
+    /** All of it. @type {Promise<Bytes>} */
+    this.bytes = Promise.resolve(new Uint8Array(0));
+    /** @type {{size: number, resolve: (bytes: Bytes) => void}[]} */
+    this.waiting = [];
+    this.here = new Uint8Array(0);
+  }
+
+  /** @param {Bytes} here its bytes so far */
+  take(here) {
+    this.here = here;
+    for (const { size, resolve } of this.waiting) if (size <= here.length) resolve(here);
+    this.waiting = this.waiting.filter(({ size }) => size > here.length);
+  }
+
+  /**
+   * Wait for its first bytes.
+   *
+   * @param {number} size
+   * @returns {Promise<Bytes>} these, and perhaps more
+   */
+  first(size) {
+    if (size <= this.here.length) return Promise.resolve(this.here);
+    const arrived = new Promise((/** @type {(bytes: Bytes) => void} */ resolve) =>
+      this.waiting.push({ size, resolve }),
+    );
+    return Promise.race([this.bytes, arrived]);
+  }
+}
+
 /** A file on a server. */
 export class HttpSource {
   /** @param {Transport} transport */
@@ -171,8 +211,8 @@ export class HttpSource {
     this.transport = transport;
     /** The first bytes. @type {Bytes} */
     this.head = new Uint8Array(0);
-    /** @type {{start: number, end: number, bytes: Promise<Bytes>, due: number, signal?: AbortSignal}[]} */
-    this.fetched = []; // prefetched ranges, each kept until all its parts have been read
+    /** Prefetched ranges, each kept until all its parts have been read. @type {ArrivingRange[]} */
+    this.fetched = [];
     /** @type {WholeSource | null} */
     this.whole = null;
   }
@@ -226,7 +266,7 @@ export class HttpSource {
   async readBehindHead(start, end, signal) {
     const range = this.fetched.find((one) => one.start <= start && end <= one.end);
     if (range === undefined) return this.fetch(start, end, signal);
-    const bytes = await range.bytes.catch((error) => {
+    const bytes = await range.first(end - range.start).catch((error) => {
       if (!range.signal?.aborted || signal?.aborted) throw error;
     });
     if (!bytes) return this.fetch(start, end, signal); // another reader has cancelled the request
@@ -260,7 +300,8 @@ export class HttpSource {
       } else joined.push({ start: offset, end: offset + size, due: 1 });
     }
     for (const range of joined) {
-      const entry = { ...range, signal, bytes: this.fetch(range.start, range.end, signal) };
+      const entry = new ArrivingRange(range, signal);
+      entry.bytes = this.fetch(range.start, range.end, signal, entry);
       const drop = () => (this.fetched = this.fetched.filter((one) => one !== entry)); // allows another try
       entry.bytes.catch(drop);
       if (signal) onAbort(signal, drop);
@@ -272,10 +313,11 @@ export class HttpSource {
    * @param {number} start
    * @param {number} end
    * @param {AbortSignal} [signal]
+   * @param {ArrivingRange} [arriving] receives the bytes as they arrive
    * @returns {Promise<Bytes>}
    */
-  async fetch(start, end, signal) {
-    const bytes = await this.#collect(start, end, signal);
+  async fetch(start, end, signal, arriving) {
+    const bytes = await this.#collect(start, end, signal, arriving);
     if (bytes === null) return /** @type {WholeSource} */ (this.whole).read(start, end - start, signal);
     if (bytes.length < end - start) throw shortData(start + bytes.length, end - start);
     return bytes;
@@ -287,9 +329,10 @@ export class HttpSource {
    * @param {number} start
    * @param {number} end
    * @param {AbortSignal} [signal]
+   * @param {ArrivingRange} [arriving]
    * @returns {Promise<Bytes | null>} fewer bytes if the file ends before; null if the whole file is on its way
    */
-  async #collect(start, end, signal) {
+  async #collect(start, end, signal, arriving) {
     const { transport } = this;
     const tries = transport.tries(signal);
     let bytes = new Uint8Array(Math.min(end - start, UNSEEN_BYTES));
@@ -313,6 +356,7 @@ export class HttpSource {
           bytes.set(taken, filled);
           transport.arrivals.count(start + filled, start + filled + taken.length);
           filled += taken.length;
+          arriving?.take(bytes.subarray(0, filled));
           if (start + filled >= until) break;
         }
         const got = filled - before;

@@ -91,10 +91,13 @@ fn read_centre(tile: Tile, index: u32) -> vec3<f32> {
 }
 
 fn read_opacity(tile: Tile) -> f32 {
-  let value = number(tile.opacity_bits);
-  if (tile.opacity_bits == 32u) { return value; }
-  let share = value / tile.opacity_levels;
-  return select(share, share * share, (tile.flags & OPACITY_SQUARED) != 0u);
+  var opacity = number(tile.opacity_bits);
+  if (tile.opacity_bits != 32u) {
+    opacity /= tile.opacity_levels;
+    if ((tile.flags & OPACITY_SQUARED) != 0u) { opacity *= opacity; }
+  }
+  let hidden = f32(tile.flags >> 26u) / 8.0; // of a tile that fades, see `fadedAlpha` in codec/js/levels/shown_tiles.mjs
+  return opacity * (1.0 - hidden) * (1.0 + 0.34 * opacity * hidden);
 }
 
 fn read_log_scales(tile: Tile) -> vec3<f32> {

@@ -124,6 +124,11 @@ def test_an_estimated_up_direction_is_marked_until_another_is_given():
     assert [] == SceneMetadata(entries={"estimated": "up"}).estimated
 
 
+def test_an_estimated_view_is_for_one_up_direction():
+    for source, left in (("estimate", {"up"}), ("training", {"up", "view"}), ("author", {"up", "view"})):
+        assert left == SceneMetadata(entries={"view": {"from": source}}).with_up((0, 0, 1)).entries.keys()
+
+
 def test_a_colour_space_is_registered_or_the_number_of_an_unknown_one():
     for space in ("srgb_rec709_display", "lin_rec709_display", "128", "255"):
         assert space == SceneMetadata(colour_space=space).colour_space

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from csplat.errors import InputError
 from csplat.types import null_progress
 from csplat_tools import console
 from csplat_tools.console import Display, displayed, progress_bar, step_progress
@@ -84,7 +85,22 @@ def test_a_stage_may_have_its_own_text_and_long_runs_announce_their_time(clock, 
             for iteration in iterations:  # a run that resumes
                 show(SimpleNamespace(iteration=iteration, iterations=5000))
                 clock.now += 4.0
-        assert announced == ("2 to 5 minutes" in capsys.readouterr().err)
+        assert announced == ("2 to 4 minutes" in capsys.readouterr().err)
+
+
+def test_an_expected_time_is_announced_before_the_first_step_and_again_if_the_run_takes_longer(clock, capsys):
+    with step_progress("training", lambda _: "", expected=100.0, clock=clock) as show:
+        assert "training takes about 1 to 2 minutes\n" == capsys.readouterr().err  # 80 to 150 s
+        for iteration in range(0, 600, 100):
+            show(SimpleNamespace(iteration=iteration, iterations=1000))
+            clock.now += 13.0
+        assert "" == capsys.readouterr().err
+        for iteration in range(600, 1000, 100):
+            show(SimpleNamespace(iteration=iteration, iterations=1000))
+            clock.now += 60.0
+    assert "training takes longer than that here: about 59 s from now\n" == capsys.readouterr().err
+    with step_progress("training", lambda _: "", expected=100.0, quiet=True):
+        assert "" == capsys.readouterr().err
 
 
 def test_a_terminal_shows_bars_after_two_seconds_and_removes_them_before_other_output(clock, monkeypatch, capsys):
@@ -113,6 +129,11 @@ def test_quiet_and_nested_displays_show_nothing_and_durations_are_short():
         assert (outer, null_progress) == (inner, silent)
     with progress_bar() as later:
         assert later not in (null_progress, outer)  # the first display went with its work
+    times = {"30min": 1800.0, "1h": 3600.0, " 1 h 30 min": 5400.0, "0.5H": 1800.0, "90s": 90.0, "1h1s": 3601.0}
+    assert times == {text: console.parse_seconds(text) for text in times}
+    for text in ("", "0min", "30", "1min1h", "-1h", "1e400h"):
+        with pytest.raises(InputError, match="expected hours, minutes or seconds"):
+            console.parse_seconds(text)
     durations = {0.2: "0 s", 99.4: "99 s", 110.0: "2 minutes", 24116.0: "6 h 42 min"}
     assert durations == {seconds: console.format_seconds(seconds) for seconds in durations}
     ranges = {(20.0, 50.0): "20 to 50 s", (30.0, 110.0): "1 to 2 minutes", (120.0, 290.0): "2 to 5 minutes"}

@@ -33,6 +33,7 @@ from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
 from csplat_render.camera_files import save_cameras
 from csplat_render.camera_paths import orbit_cameras
+from csplat_render.first_view import viewing_metadata
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.cli.shared_options import parse_level
@@ -422,12 +423,14 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
     out = tmp_path / "plain.csplat"
     for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one
         encode_file(load_scene(model), str(out), EncodeOptions(), **levels)
-        assert csplat.encode(model) == out.read_bytes()
+        assert csplat.encode(model.with_metadata(viewing_metadata(model))) == out.read_bytes()
     wanted = {
         (10**9, None): None,
         (4096, "auto"): None,
         (4097, "auto"): FittedLevelBuilder(),
         (9, 2): FittedLevelBuilder(2),
+        (2_000_001, "auto"): FittedLevelBuilder(leaf_splats=1 << 15),
+        (40_000_001, "auto"): FittedLevelBuilder(),
         (4096, "merged"): None,
         (4097, "merged"): FittedLevelBuilder(fits=False),
     }

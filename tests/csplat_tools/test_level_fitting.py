@@ -9,6 +9,7 @@ import pytest
 import csplat
 from csplat import LimitError
 from csplat.scene import join_blocks
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_fitting import LevelFitter, Work, make_backdrop
@@ -64,6 +65,21 @@ def test_a_backdrop_covers_as_much_as_the_scene_and_does_not_stand_for_the_part(
     inside = (backdrop.means[:, None] == part.means).all(axis=2).any(axis=1)
     np.testing.assert_array_equal(backdrop.means[~inside], rest.means)
     assert 0 < np.count_nonzero(inside) < len(backdrop)
+
+
+def test_every_other_view_of_a_coarse_level_of_surroundings_is_farther_away(sample):
+    ball = sample.select(slice(0, 500))
+    apart = np.where(np.arange(500) % 3, 1.0, 40.0)[:, None]  # a third of the splats is all around the others
+    room = replace(ball, means=(ball.means * apart).astype(np.float32), means_double=None)
+    fitter = LevelFitter(room, work=Work(0.0, (8, 8), 0.0, (5, 5)))
+    frame = scene_frame(room)
+    assert ["surrounding", "object"] == [frame.kind, scene_frame(ball).kind]
+    near, far = (
+        [np.linalg.norm(camera.position - frame.centre) for camera in fitter._views(level)] for level in (1, 3)
+    )  # fmt: skip
+    np.testing.assert_allclose(np.tile([1.0, 4.0], len(near) // 2), np.divide(far, near))
+    for inside in (replace(fitter, scene=ball), replace(fitter, backdrop=make_backdrop(room, len(room)))):
+        assert inside._views(1) is inside._views(3)
 
 
 class Crowded(LevelFitter):

@@ -155,7 +155,7 @@ def test_either_engine_resumes_a_training_of_the_other(make_model, tmp_path):
 
 def test_the_command_trains_in_torch_and_tunes_likewise(tmp_path):
     photograph_object(shell(3), tmp_path)
-    words = ("--engine", "torch", "--iterations", 4, "--max-splats", 50, "--json")
+    words = ("--device", "torch", "--iterations", 4, "--max-splats", 50, "--json")
     log = json.loads(call("train", tmp_path, tmp_path / "a.ply", *words).stdout)
     assert "torch" == log["options"]["engine"]
     assert "torch" == tuning_after(TrainOptions(engine="torch")).engine

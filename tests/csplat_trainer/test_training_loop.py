@@ -26,7 +26,7 @@ from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_render.camera import Camera, relative_to
-from csplat_tools.training.training_run import plan_training, tuning_after
+from csplat_tools.training.training_run import explain_size, plan_training, tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
@@ -125,7 +125,7 @@ def test_splats_start_within_the_hull_of_all_masks_or_in_a_box(data, make_model)
 
 
 def test_the_first_view_of_surroundings_is_a_training_camera(data):
-    assert "view" not in train(data, brief(strategy="none")).model.metadata.entries  # an object
+    assert "estimate" == train(data, brief(strategy="none")).model.metadata.entries["view"]["from"]  # an object
     rng = np.random.default_rng(0)
     far = rng.standard_normal((60, 3)) * 40.0
     points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
@@ -247,7 +247,7 @@ def test_one_training_gives_several_files(file_runs):
     assert 0.75 * usual["splats"] == pytest.approx(few["splats"], abs=2)
     bound = usual["size_bytes"] + 200
     assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
-    wanted = usual["validation"]["psnr"] - 0.25  # of twenty splats, nearer goals are out of reach
+    wanted = usual["validation"]["psnr"] - 0.75  # of twenty splats, nearer goals are out of reach
     good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
     assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.05
     assert trained == file_runs.checkpoint.read_bytes()
@@ -264,9 +264,24 @@ def test_a_training_is_planned_by_its_target_and_its_tuning_by_its_length():
     with pytest.raises(InputError, match="max_psnr_drop is no target of train"):
         plan_training(TrainOptions(), Target(max_psnr_drop=1.0))
     short, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
-    assert FinetuneOptions(lr_exposure=0.01) == short
+    assert FinetuneOptions(iterations=500, warm_up=50, lr_exposure=0.01) == short
+    assert [1, 8, 1_000, 1_167] == [tuning_after(TrainOptions(iterations=n)).iterations for n in (5, 30, 4_000, 7_000)]
     assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
     assert usual.lr_scales / short.lr_scales == pytest.approx(1 / 3)
+
+
+def test_a_file_much_smaller_than_its_largest_size_is_explained_by_splats_or_steps():
+    for grown, most, size_bytes, text in (
+        (20_000, 25_000, 150_000, "the 20,000 splats; more need a larger --max-splats than 25,000"),
+        (9_000, 9_000, 90_000, "the 9,000 splats that --max-splats allows, the size 20,000"),
+        (700, 25_000, 7_000, "the 700 splats to which 30 steps grew the scene"),
+        (20_000, 25_000, 199_000, None),
+    ):  # fmt: skip
+        training = {"splat_count": grown, "options": {"max_splats": most, "iterations": 30}}
+        result = {"training": training, "file": {"size_bytes": size_bytes, "splats": grown}}
+        lines = explain_size(result, Target(size=200_000))
+        assert [text] == [None for _ in range(not lines)] + [text for line in lines if text and text in line]
+        assert [] == explain_size(result, Target(psnr=30.0))
 
 
 def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_training(data, tmp_path, monkeypatch):

@@ -11,9 +11,11 @@ import json
 import numpy as np
 import pytest
 from captures import training_images
-from train_cases import QUICK, assert_resumes_identically
+from PIL import Image
+from train_cases import QUICK, SIZE, assert_resumes_identically
 
 from csplat.errors import InputError
+from csplat_trainer import training_loop
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs, TrainOptions
 from csplat_trainer.training_report import moving_average
@@ -41,12 +43,23 @@ def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, strategy):
     assert_resumes_identically(data, TrainOptions(**QUICK, strategy=strategy), tmp_path)
 
 
-def test_progress_log_and_previews_are_written(data, tmp_path):
-    seen, previews = [], tmp_path / "p"
-    outputs = Outputs(previews=previews, preview_every=30)
-    result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
+@pytest.mark.parametrize(("seconds", "count"), [(0.0, 60), (1e9, 2)])
+def test_the_preview_is_renewed_by_time_and_after_the_last_step(data, tmp_path, monkeypatch, seconds, count):
+    written, preview = [], tmp_path / "p.png"
+    write = training_loop.save_image
+    monkeypatch.setattr(training_loop, "save_image", lambda *one: (written.append(one), write(*one)))
+    outputs = Outputs(preview=preview, preview_seconds=seconds)
+    shown, plain = (train(data, TrainOptions(**QUICK), outputs=one).model for one in (outputs, Outputs()))
+    assert np.array_equal(plain.means, shown.means)
+    assert count == len(written)
+    with Image.open(preview) as image:
+        assert (2 * SIZE, SIZE) == image.size
+
+
+def test_progress_and_log_are_written(data):
+    seen = []
+    result = train(data, TrainOptions(**QUICK), on_step=seen.append)
     assert [2, 10, 20, 30, 40, 60] == [now.iteration for now in seen]
-    assert ["000030.png", "000060.png"] == sorted(path.name for path in previews.iterdir())
     assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
     log = json.loads(json.dumps(result.log, allow_nan=False))
     assert 60 == len(log["losses"])
@@ -81,11 +94,13 @@ def test_the_native_engine_is_refused_on_a_gpu(options):
 
 
 def test_growth_reaches_the_cap_halfway_and_sh_degrees_are_activated_one_by_one():
-    options, count = TrainOptions(max_splats=1000, iterations=2000, refine_start=100), 10.0
+    options, count = TrainOptions(max_splats=1000, iterations=2000), 10.0
     for step in range(1, options.refine_end // 2 + 1):
         if options.refines_after(step):
             count *= options.growth_from(10)
     assert 1000 == pytest.approx(count)
+    assert (250, 500, 2) == tuple(TrainOptions(iterations=steps).refine_begin for steps in (2_000, 30_000, 20))
+    assert (50, 100, 10) == tuple(TrainOptions(iterations=steps).refine_period for steps in (2_000, 30_000, 20))
     assert (1.05, 1.5) == (options.growth_from(1000), TrainOptions(growth=1.5).growth_from(10))
     degrees = TrainOptions(iterations=1500, sh_degree=2)
     assert [0, 1, 2, 2] == [degrees.active_degree(step) for step in (0, 100, 200, 1400)]

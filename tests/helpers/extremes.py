@@ -30,6 +30,7 @@ from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optional_packages import describe_machine
 from csplat_trainer.data import DataSet
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.training_loop import train
@@ -316,15 +317,12 @@ def measure(name):
         data, count = encoded(name, preset).data, len(scene(name))
         figures = {"bytes_per_splat": round(len(data) / count, 1 if len(data) > count else 4)}
         row[preset] = figures | ({"psnr": round(scorer(name).psnr(decode(data)), 1)} if name in DRAWN else {})
-    losses = trained(name).log["losses"]
     row["half_psnr"] = round(scorer(name, SMALL).psnr(half(name).model), 1)
-    row["loss_before"], row["loss_after"] = (round(float(np.mean(part)), 2) for part in (losses[:10], losses[-10:]))
-    if name != "exploded":
-        before, after, _, views = tuned(name)
-        row["untuned_psnr"], row["tuned_psnr"] = (round(views.psnr(model), 1) for model in (before, after))
     return row
 
 
 if __name__ == "__main__":
-    document = json.loads(RESULTS.read_text("utf-8")) | {"rows": [measure(name) for name in NAMES]}
+    found = describe_machine()
+    machine, rows = f"{found['processor']}, {found['cores']} cores", [measure(name) for name in NAMES]
+    document = {"command": "python tests/helpers/extremes.py", "machine": machine, "rows": rows}
     RESULTS.write_text(json.dumps(document, indent=1) + "\n", "utf-8")

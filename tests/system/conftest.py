@@ -35,7 +35,7 @@ def encoded_once():
 
 
 @pytest.fixture
-def csplat_file(tmp_path, ply, encoded_once):
+def csplat_file(tmp_path, ply, encoded_once, no_first_view):  # noqa: ARG001  # the same bytes in every module
     """The file of `ply`, with its source index next to it."""
     names = ("scene.csplat", "index.npy")
     if not encoded_once:
@@ -47,6 +47,6 @@ def csplat_file(tmp_path, ply, encoded_once):
 
 
 @pytest.fixture
-def no_estimated_up(monkeypatch):
-    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
-    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+def no_first_view(monkeypatch):
+    """Choose no first view and no up direction, which takes longer than encoding small scenes."""
+    monkeypatch.setattr("csplat_tools.scene_files.viewing_metadata", lambda model, **_: model.metadata)

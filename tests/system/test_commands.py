@@ -21,7 +21,7 @@ from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_tools.file_streams import check_output, write_bytes
 
-pytestmark = pytest.mark.usefixtures("no_estimated_up")
+pytestmark = pytest.mark.usefixtures("no_first_view")
 
 
 def test_decodes_fewer_bands(tmp_path, csplat_file):

@@ -32,7 +32,7 @@ from csplat.ply import read_ply
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import encode_file
 
-pytestmark = pytest.mark.usefixtures("no_estimated_up")
+pytestmark = pytest.mark.usefixtures("no_first_view")
 
 
 @contextmanager

@@ -284,7 +284,7 @@ def test_measured_importances_serve_the_object_in_front_of_a_giant_background():
 
 @LONG
 def test_a_pile_of_identical_splats_requires_a_finer_quality():
-    """Errors of alpha add up; the figures are those of the results page."""
+    """Errors of alpha add up."""
     source, views = extremes.small_scene("a million identical"), scorer("a million identical", extremes.SMALL)
     expected = ("small", None, 22.3), ("balanced", None, 30.0), ("fast", None, 35.1), ("balanced", 70.0, 37.9)
     for preset, quality, psnr in expected:

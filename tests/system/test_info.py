@@ -15,7 +15,7 @@ from command_line import printed, refused, status_of
 
 from csplat_conformance.manifest import VECTORS
 
-pytestmark = pytest.mark.usefixtures("no_estimated_up")
+pytestmark = pytest.mark.usefixtures("no_first_view")
 
 
 @pytest.mark.slow

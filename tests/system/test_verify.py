@@ -13,7 +13,7 @@ from command_line import invoke, printed, refused
 from csplat import _spec, write_ply
 from csplat.ply import read_ply
 
-pytestmark = pytest.mark.usefixtures("no_estimated_up")
+pytestmark = pytest.mark.usefixtures("no_first_view")
 
 
 def test_decode_and_verify_refuse_more_splats_than_allowed(tmp_path, csplat_file):

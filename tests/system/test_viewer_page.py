@@ -16,6 +16,7 @@ from csplat import EncodeOptions, decode, encode, read_header
 from csplat.ply import read_ply
 from csplat_conformance.validator import validate
 from csplat_render import camera
+from csplat_render.camera_files import load_cameras
 from csplat_tools.level_builder import FittedLevelBuilder
 
 pytestmark = pytest.mark.slow
@@ -229,6 +230,17 @@ def test_the_automatic_camera_sees_the_object_whatever_outliers_do(viewer, model
     assert 0.15 < (viewer.picture()[..., :3].max(axis=2) > 40).mean() < 0.9
 
 
+def test_the_camera_does_not_move_while_a_scene_loads(viewer, model):
+    viewer.site.bytes_per_second = 100_000
+    viewer.begin(encode(model, EncodeOptions(preset="fast", tile_splats=200)))
+    viewer.until("csplatViewer.engine?.bounds?.coarse")
+    first = viewer.viewmat
+    viewer.site.bytes_per_second = 0
+    viewer.page.evaluate("shown")
+    assert viewer.page.evaluate("!csplatViewer.engine.bounds.coarse")
+    assert first == viewer.viewmat
+
+
 def look_at(eye):
     K = [[90.0, 0.0, 40.0], [0.0, 90.0, 30.0], [0.0, 0.0, 1.0]]
     viewmat = camera.look_at(eye, (0, 0, 0), (0, -1, 0), K, 80, 60).viewmat.tolist()
@@ -324,6 +336,27 @@ def test_turning_upright_can_be_kept(viewer, make_model):
         page.keyboard.press("u")
     assert "z is up, as in the file" == viewer.text("#toast")
     assert viewer.hides("#keep")
+
+
+def test_the_current_camera_can_be_kept_as_the_first_view(viewer, make_model, tmp_path):
+    viewer.show(encode(make_model(60, 1)))
+    page = viewer.page
+    page.keyboard.press("ArrowLeft", delay=30)
+    viewer.settle()
+    page.keyboard.press("v")
+    assert "csplat encode scene.ply scene.csplat --cameras view.json" == viewer.text("#keep-command")
+    name, text = downloaded(page, "#keep-camera")
+    _, kept = downloaded(page, "#keep-download")
+    assert "view.json" == name
+    view = decode(kept).metadata.entries["view"]
+    assert [{key: value for key, value in view.items() if key != "from"}] == json.loads(text)
+    assert "author" == view["from"]
+    assert validate(kept).conforms
+    before = viewer.viewmat
+    viewer.show(kept)
+    assert np.allclose(before, viewer.viewmat, atol=1e-6)
+    (tmp_path / name).write_bytes(text)
+    assert np.allclose(view["viewmat"], load_cameras(tmp_path / name)[0].viewmat)
 
 
 def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model):

@@ -7,6 +7,8 @@ Progress is a bar on a terminal, otherwise a line every ten seconds. There is at
 from __future__ import annotations
 
 import json
+import math
+import re
 import sys
 import threading
 import time
@@ -15,6 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
+from csplat.errors import InputError
 from csplat.file_source import named_errors
 from csplat.types import Progress, null_progress
 
@@ -28,7 +31,8 @@ _LINE_EVERY = 10.0  # seconds between lines if standard error is not a terminal
 _TICK = 0.2  # seconds between updates of the display
 _ESTIMATE_FROM = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
 _TIMED_REPORTS = 2  # number of reports of a long run after which its time is estimated
-_RUN_RANGE = (0.8, 2.0)  # range of that estimate, as factors: steps get slower as a scene grows
+_RUN_RANGE = (0.8, 1.5)  # range of the estimate of a run, as factors
+_SURE_SECONDS = 20.0  # time after which a run's own steps overrule the estimate
 _RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
 _STAGES = 2  # stages shown at a time: the last that were reported
 _WORKING = "working"  # shown if no stage is known
@@ -38,6 +42,8 @@ _HOURS_FROM = 100  # minutes; longer durations are given in hours
 #: Regular expression of a number, with one group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 
+
+_DURATION = re.compile(rf"(?:{NUMBER}\s*h)?\s*(?:{NUMBER}\s*min)?\s*(?:{NUMBER}\s*s)?")
 
 STANDARD_OUTPUT = "standard output"  # its name in messages
 
@@ -94,13 +100,19 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
 
 @contextmanager
 def step_progress(
-    name: str, describe: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+    name: str,
+    describe: Callable[[S], str],
+    *,
+    expected: float | None = None,
+    quiet: bool = False,
+    clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Callable[[S], None] | None]:
-    """Show the progress of a long run with its own text, and announce its expected time.
+    """Show the progress of a long run with its own text, and announce its expected time, again if it turns out longer.
 
     Args:
         name: name of the run.
         describe: returns a line on the state of the run and the time left.
+        expected: expected time of the run, seconds; `None`: it is estimated from the first reports.
         quiet: show nothing.
         clock: returns seconds.
 
@@ -108,19 +120,31 @@ def step_progress(
         A callback for each step; `None` if nothing is shown.
     """
     reports: list[tuple[float, int]] = []
+    begun, most = clock(), math.inf if expected is None or quiet else _announce(name, expected)
 
     def show(now: S) -> None:
+        nonlocal most
         reports.append((clock(), now.iteration))
-        if len(reports) == _TIMED_REPORTS:  # the first steps are slower, since they load and compile
-            (begun, first), (seconds, last) = reports[0], reports[-1]
-            left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
-            if left > LONG_WORK_SECONDS:
-                note(f"{name} takes about {format_range(_RUN_RANGE[0] * left, _RUN_RANGE[1] * left)} from here")
+        if len(reports) >= _TIMED_REPORTS:  # the first steps are slower, since they load and compile
+            (first_seconds, first), (seconds, last) = reports[0], reports[-1]
+            left = (seconds - first_seconds) / max(1, last - first) * (now.iterations - last)
+            if expected is None and len(reports) == _TIMED_REPORTS:
+                most = seconds - begun + _announce(name, left, " from here")
+            elif left > LONG_WORK_SECONDS and seconds - begun > _SURE_SECONDS and seconds - begun + left > most:
+                note(f"{name} takes longer than that here: about {format_seconds(left)} from now")
+                most = _RUN_RANGE[1] * (seconds - begun + left)
         if display is not None:
             display.report(name, now.iteration / now.iterations, describe(now))
 
     with _ticking_display(quiet=quiet) as display:
         yield None if display is None else show
+
+
+def _announce(name: str, seconds: float, suffix: str = "") -> float:
+    """Announce the expected time of a run, unless it is short; return the upper end of the announced range, seconds."""
+    if seconds > LONG_WORK_SECONDS:
+        note(f"{name} takes about {format_range(_RUN_RANGE[0] * seconds, _RUN_RANGE[1] * seconds)}{suffix}")
+    return max(LONG_WORK_SECONDS, _RUN_RANGE[1] * seconds)
 
 
 @dataclass
@@ -231,6 +255,21 @@ def format_seconds(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60.0)
     return f"{minutes} minutes" if minutes < _HOURS_FROM else f"{minutes // 60} h {minutes % 60} min"
+
+
+def parse_seconds(text: str) -> float:
+    """Parse a duration: `90s`, `30min`, `1.5h`, `1h30min`; return seconds.
+
+    Raises:
+        InputError: it is not a duration, or 0.
+    """
+    match = _DURATION.fullmatch(text.strip().lower())
+    seconds = sum(
+        float(number) * unit for number, unit in zip(match.groups(), (3600.0, 60.0, 1.0), strict=True) if number
+    ) if match else 0.0  # fmt: skip
+    if not 0.0 < seconds < math.inf:
+        raise InputError(f"a time is {text!r}, expected hours, minutes or seconds, as 1h, 30min or 90s")
+    return seconds
 
 
 def format_estimate(seconds: float) -> str:

@@ -26,8 +26,9 @@ from csplat.scene_metadata import UNSPECIFIED, UP
 from csplat.splat_file import SplatFile
 from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
-from csplat_tools.scene_files import MetadataOverrides, findings_as_json, with_progress
+from csplat_tools.scene_files import MetadataOverrides, findings_as_json, with_first_view, with_progress
 
+_WITH_VIEW = ("csplat", "gltf-csplat")  # formats whose viewers start at the view of the file
 _CELL = 0.01  # radius of a splat's neighbourhood, as a fraction of the scene's extent
 _SPREAD = 4.0  # the same in standard deviations of the splat, used if it is larger
 _OCTAVES_MAX = 40.0  # doublings of the cell for larger splats, so that its size stays finite
@@ -332,6 +333,8 @@ def convert_file(
         filter_axes = changes.axes or changes.to_axes or own or before
         changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
+        if writes.name in _WITH_VIEW and not dry_run and not writes.keeps(levels[0]):
+            levels = [with_first_view(levels[0], progress=progress)]
         scene, counts = levels[0], tuple(changed.count for changed in levels if changed.count)
         lost, keeps = writes.losses(scene), writes.keeps(scene)
         exact = frozenset(ARRAYS) if keeps else writes.exact

@@ -24,7 +24,7 @@ from csplat.scene import Scene
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_levels, read_streamed_levels
-from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_source
+from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_source, with_first_view
 
 _PLY_FACTOR = 8  # memory of an encoding divided by the size of its PLY, at most; 3 for float32 columns, more for bytes
 _MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
@@ -109,10 +109,11 @@ def encode_file(
     prune_unseen: bool = False,
     source_index: str | None = None,
     levels: LevelCount = None,
+    first_view: str | None = None,
     format: str | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> EncodedFile:
-    """Read a scene file, encode it, and write the .csplat file.
+    """Read a scene file, encode it, and write the .csplat file, with the first view for viewers.
 
     Args:
         source: a scene in any format, or `-`; or a scene that `read_source` has read.
@@ -128,6 +129,7 @@ def encode_file(
         levels: number of levels of detail above the scene, 1 to 16; "auto": until the coarsest has 4,096 splats;
             "merged": the same without a fit to renders; `None`: none. Levels of streamed SOG are taken instead, unless
             splats may be pruned.
+        first_view: a camera file, of which the first camera is the first view; `None`: see `viewing_metadata`.
         format: as for `csplat.open`.
 
     Raises:
@@ -155,18 +157,19 @@ def encode_file(
                 "format": format, "strict": strict, "keep_extra": options.keep_extra, "sh_degree": read_degree(options),
                 "context": context,
             }  # fmt: skip
+            context.progress("reading", 0.0)
             if levels is None and (whole or _surely_fits(local, format, context)):
                 scene, builder = read_source(local, overrides, **reading), None
             else:
-                context.progress("opening", 0.0)
                 opened = stack.enter_context(csplat.open(local, format, sh_degree=read_degree(options)))
-                context.progress("opening", 1.0)
                 builder = choose_levels(opened.count, options, levels)
                 has_levels = opened.format == "sog" and len(opened.levels) > 1
                 if builder is not None and has_levels and not (target or importance):
                     builder, whole = _levels_of_source(local, builder, context), True
                 in_memory = whole or estimate_cost(opened, options, context, builder, out=output).in_memory
                 scene = read_source(local, overrides, opened=opened, in_memory=in_memory, **reading)
+            context.progress("reading", 1.0)
+        scene = with_first_view(scene, first_view, progress=context.progress)
         drops = target is None and options.kept_degree(scene.sh_degree) < scene.sh_degree
         try:
             if scene.in_memory is None:

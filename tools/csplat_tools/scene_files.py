@@ -21,10 +21,12 @@ from csplat.lint import Finding, refuse
 from csplat.model import SplatModel
 from csplat.ply.column_names import dropped_columns
 from csplat.scene import Scene, drop_bands, join_blocks
-from csplat.scene_metadata import LICENCE, Direction, SceneMetadata
+from csplat.scene_metadata import AUTHOR, LICENCE, VIEW, Direction, SceneMetadata
 from csplat.splat_file import SplatFile
 from csplat.system import available_memory_bytes
 from csplat.types import Progress
+from csplat_render.camera_files import load_cameras
+from csplat_render.first_view import SAMPLE_SPLATS, view_entry, viewing_metadata
 from csplat_tools.file_streams import is_csplat, kept_path, local_path, naming, source_path
 
 #: Formats that are opened without unpacking, and are read as a whole in fewer passes.
@@ -34,7 +36,7 @@ _SMALL = 1 << 20  # bytes; smaller files of any format always fit in memory
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 #: Largest number of splats, about, by which cameras are placed in a .csplat file with levels.
 FRAMED_SPLATS = 2_000_000
-SAMPLE_SPLATS = 1 << 19  # splats of a sample of a scene that does not fit in memory
+_SAMPLE_SPLATS = 1 << 19  # splats of a sample of a scene that does not fit in memory
 
 
 #: A scene as an argument: a model, an open scene, or a file in any format.
@@ -218,7 +220,7 @@ def _together_bytes(scenes: Sequence[Scene]) -> float:
 
 
 def sample_scene(
-    scene: Scene, *, splats_max: int = SAMPLE_SPLATS, progress: Progress | None = None
+    scene: Scene, *, splats_max: int = _SAMPLE_SPLATS, progress: Progress | None = None
 ) -> tuple[SplatModel, int]:
     """Return every Nth splat without SH bands, and N; for a scene in memory, all splats and 1.
 
@@ -273,6 +275,34 @@ def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict
 def ply_splat_bytes(sh_degree: int) -> int:
     """Return the bytes of a splat in a PLY of the INRIA trainer, which has float columns: 248 at SH degree 3."""
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)  # 14: position, normal, opacity, scale, rotation; the others: colours
+
+
+def with_first_view(
+    scene: Scene, camera: str | Path | None = None, *, report: list[str] | None = None, progress: Progress | None = None
+) -> Scene:
+    """Return a scene whose metadata have a first view and an up direction, as `viewing_metadata` chooses them.
+
+    Args:
+        scene: the scene; its blocks are read once if it is not in memory and lacks one of both.
+        camera: a camera file, whose first camera is the view of an author; `None`: a view that the scene has, or an
+            estimate.
+        report: receives remarks on camera files of other programs.
+        progress: progress callback.
+
+    Raises:
+        InputError: the camera file has no cameras.
+        CsplatError: the scene is truncated or damaged.
+    """
+    metadata = scene.metadata
+    if camera is not None:
+        first = load_cameras(camera, report, scene.origin)[0]
+        metadata = metadata.with_entries(view=view_entry(first, AUTHOR))
+    if VIEW not in metadata.entries or metadata.up is None:
+        sample, every = sample_scene(scene, splats_max=SAMPLE_SPLATS, progress=progress)
+        metadata = viewing_metadata(sample.with_metadata(metadata), every=every)
+    if scene.in_memory is not None:
+        return scene.changed(metadata=metadata, in_memory=scene.in_memory.with_metadata(metadata))
+    return scene.map(lambda block: block.with_metadata(metadata))
 
 
 def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:

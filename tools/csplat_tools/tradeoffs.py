@@ -30,7 +30,7 @@ from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.comparison import compare
 from csplat_tools.optional_packages import describe_machine, require_renderer
-from csplat_tools.scene_files import SceneLike, load_scene, read_source, scene_sizes
+from csplat_tools.scene_files import SceneLike, load_scene, read_source, scene_sizes, with_first_view
 from csplat_tools.views import ViewSet, describe_views, find_view_set
 
 if TYPE_CHECKING:
@@ -242,12 +242,13 @@ def tradeoff(
     if not source.count:
         raise InputError("the scene has no splats")
     around = views or find_view_set(source.model(), seed=context.seed)
+    viewed = with_first_view(source).model()  # as `csplat encode` writes it
 
     def measure(setting: GridSetting) -> TradeoffRow:
         """Encode the scene with a setting, decode the file, and score it."""
         start = time.perf_counter()
         used = around if setting.target else None
-        made = encode_with_report(source.model(), setting.options, target=setting.target, views=used, context=context)
+        made = encode_with_report(viewed, setting.options, target=setting.target, views=used, context=context)
         encode_seconds = time.perf_counter() - start
         decoded, decode_seconds = _time_decoding(made.data, context)
         compared = compare(source, decoded, views=around, source_index=made.source_index, context=context)

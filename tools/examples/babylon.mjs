@@ -14,22 +14,22 @@ const scene = new Scene(engine);
 scene.clearColor = new Color4(0, 0, 0, 1);
 const camera = new ArcRotateCamera('camera', 0, 0, 1, Vector3.Zero(), scene);
 camera.attachControl();
-addEventListener('resize', () => engine.resize());
 try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const onProgress = ({ loaded }) => (words.textContent = `${loaded} bytes`);
   const {
     meshes: [splats],
   } = await ImportMeshAsync(url, scene, { onProgress });
-  const { center, radius } = splats.metadata.csplat.bounds;
-  camera.setTarget(Vector3.FromArray(center));
-  Object.assign(camera, {
-    alpha: -Math.PI / 2,
-    beta: 1.25,
-    radius: 3.2 * radius,
-    minZ: 0.01,
-    wheelDeltaPercentage: 0.01,
-  });
+  const { view } = splats.metadata.csplat;
+  camera.setTarget(Vector3.FromArray(view.target));
+  camera.setPosition(Vector3.FromArray(view.position));
+  Object.assign(camera, { minZ: 0.01, wheelDeltaPercentage: 0.01 });
+  const fit = () => {
+    engine.resize();
+    camera.fov = (view.fov(innerWidth / innerHeight) * Math.PI) / 180;
+  };
+  addEventListener('resize', fit);
+  fit();
   engine.runRenderLoop(() => scene.render());
   words.textContent = '';
 } catch (error) {

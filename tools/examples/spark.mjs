@@ -7,25 +7,26 @@ import { loadCsplat } from 'csplat-decoder/spark';
 
 const words = document.querySelector('#words');
 const renderer = new THREE.WebGLRenderer({ canvas: document.querySelector('canvas'), antialias: false });
-renderer.setSize(innerWidth, innerHeight, false);
-const camera = new THREE.PerspectiveCamera(45, innerWidth / innerHeight, 0.01, 1000);
-const controls = new OrbitControls(camera, renderer.domElement);
-addEventListener('resize', () => {
-  renderer.setSize(innerWidth, innerHeight, false);
-  camera.aspect = innerWidth / innerHeight;
-  camera.updateProjectionMatrix();
-});
+const camera = new THREE.PerspectiveCamera(45, 1, 0.01, 1000);
 const scene = new THREE.Scene();
 try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const splats = await loadCsplat(url, { onProgress: (loaded) => (words.textContent = `${loaded} bytes`) });
-  const {
-    header,
-    bounds: { center, radius },
-  } = splats.userData.csplat;
+  const { header, view } = splats.userData.csplat;
   const plain = { preBlurAmount: 0.3, blurAmount: 0 }; // Spark draws every scene as antialiased by default
   scene.add(new SparkRenderer({ renderer, ...(header.antialiased ? {} : plain) }), splats);
-  camera.position.copy(controls.target.fromArray(center)).add(new THREE.Vector3(0, radius, 3 * radius));
+  camera.up.fromArray(view.up);
+  camera.position.fromArray(view.position);
+  const controls = new OrbitControls(camera, renderer.domElement);
+  controls.target.fromArray(view.target);
+  const fit = () => {
+    renderer.setSize(innerWidth, innerHeight, false);
+    camera.aspect = innerWidth / innerHeight;
+    camera.fov = view.fov(camera.aspect);
+    camera.updateProjectionMatrix();
+  };
+  addEventListener('resize', fit);
+  fit();
   renderer.setAnimationLoop(() => controls.update() | renderer.render(scene, camera));
   words.textContent = '';
 } catch (error) {

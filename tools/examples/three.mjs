@@ -8,23 +8,27 @@ import { CSPLATLoader } from 'csplat-decoder/three';
 const words = document.querySelector('#words');
 const renderer = new THREE.WebGPURenderer({ canvas: document.querySelector('canvas') });
 renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // colours of splats are those of the display already
-renderer.setSize(innerWidth, innerHeight, false);
-const camera = new THREE.PerspectiveCamera(45, innerWidth / innerHeight, 0.01, 1000);
-const controls = new OrbitControls(camera, renderer.domElement);
-addEventListener('resize', () => {
-  renderer.setSize(innerWidth, innerHeight, false);
-  camera.aspect = innerWidth / innerHeight;
-  camera.updateProjectionMatrix();
-});
+const camera = new THREE.PerspectiveCamera(45, 1, 0.01, 1000);
 const scene = new THREE.Scene();
 try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const geometry = await new CSPLATLoader().loadAsync(url, ({ loaded }) => (words.textContent = `${loaded} bytes`));
   const splats = new GaussianSplat(geometry);
-  splats.applyMatrix4(geometry.userData.csplat.upright);
+  const { upright, view } = geometry.userData.csplat;
+  splats.applyMatrix4(upright);
   scene.add(splats);
-  const { center, radius } = geometry.userData.csplat.bounds;
-  camera.position.copy(controls.target.fromArray(center)).add(new THREE.Vector3(0, radius, 3 * radius));
+  camera.up.fromArray(view.up);
+  camera.position.fromArray(view.position);
+  const controls = new OrbitControls(camera, renderer.domElement);
+  controls.target.fromArray(view.target);
+  const fit = () => {
+    renderer.setSize(innerWidth, innerHeight, false);
+    camera.aspect = innerWidth / innerHeight;
+    camera.fov = view.fov(camera.aspect);
+    camera.updateProjectionMatrix();
+  };
+  addEventListener('resize', fit);
+  fit();
   renderer.setAnimationLoop(() => controls.update() | renderer.render(scene, camera));
   words.textContent = '';
 } catch (error) {

@@ -1,20 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The cameras of a scene, from its file and the page's address: their list, the initial one, and the up direction.
 
-import {
-  DEFAULT_AXES,
-  automaticPose,
-  cameraPose,
-  directionOf,
-  frontFor,
-  readCamera,
-  upOfCameras,
-  waysUp,
-} from './autocamera.mjs';
-import { findFrame } from './bounding_frame.mjs';
+import { DEFAULT_AXES, ballOf, directionOf, eyeOf, firstView, readCamera } from '../../codec/js/first_view.mjs';
 import { defaultLens } from './orbit_camera.mjs';
-import { pick } from './rough_view.mjs';
-import { dot, unitDirection } from './vectors.mjs';
+import { pick } from './pick.mjs';
+import { upOfCameras, waysUp } from './up_direction.mjs';
+import { dot, sub, unitDirection } from './vectors.mjs';
 
 /**
  * @typedef {import('./controls.mjs').Controls} Controls
@@ -23,8 +14,10 @@ import { dot, unitDirection } from './vectors.mjs';
  * @typedef {import('./types.d.ts').Bounds} Bounds
  * @typedef {import('./types.d.ts').Description} Description
  * @typedef {import('./types.d.ts').Header} Header
+ * @typedef {import('./vectors.mjs').Basis} Basis
  * @typedef {import('./vectors.mjs').Vec3} Vec3
- * @typedef {ReturnType<typeof readCamera> & {image: string}} Camera
+ * @typedef {import('../../codec/js/first_view.mjs').FileCamera} FileCamera
+ * @typedef {FileCamera & {image: string}} Camera
  */
 
 const SAME = 0.999; // cosine of the angle within which directions count as equal
@@ -53,7 +46,7 @@ const noFacts = () => {
     axes: '',
     /** @type {Camera[]} */
     cameras: [],
-    /** @type {Camera | null} initial camera in the metadata */
+    /** @type {Camera | null} first view in the metadata */
     start: null,
     /** @type {Vec3 | null} background of the training: red, green, blue, 0 to 1 */
     background: null,
@@ -66,42 +59,36 @@ export class CameraList {
   /**
    * @param {OrbitCamera} rig
    * @param {Controls} controls
-   * @param {{up: Vec3 | null, axes: string | null, seems: Vec3 | null}} wanted override the file's; `seems` is the up
-   *   direction of the first scene if nothing specifies it
+   * @param {{up: Vec3 | null, axes: string | null}} wanted override the file's
    */
   constructor(rig, controls, wanted) {
     this.rig = rig;
     this.controls = controls;
     this.wanted = wanted;
-    /** @type {Vec3 | null} */
-    this.seems = null;
     /** @type {Camera[]} from the address, for any scene */
     this.wantedCameras = [];
     this.first = 0;
     this.facts = noFacts();
     /** @type {Bounds | null} */
     this.bounds = null;
-    this.splatCount = 0;
+    /** What the header tells: a ball around most splats, and the first view. */
+    this.ball = ballOf({ tiles: [] });
+    /** @type {import('../../codec/js/first_view.mjs').FirstView | null} */
+    this.firstCamera = null;
     this.shown = 0;
     this.up = directionOf(DEFAULT_AXES, 'U');
-    /** Whether the camera still waits to be placed. */
-    this.waits = true;
   }
 
   /** Forget the previous scene. */
   begin() {
     this.facts = noFacts();
-    this.seems = this.wanted.seems;
-    this.wanted = { ...this.wanted, seems: null };
     this.bounds = null;
-    this.waits = true;
     this.controls.touched = false;
   }
 
   /** Place the camera for a new version of the scene, unless the user has moved it. */
   placeAgain() {
     this.bounds = null;
-    this.waits = true;
   }
 
   /** The cameras to step through. */
@@ -127,7 +114,8 @@ export class CameraList {
    * @param {Header} header
    * @param {Description} description
    */
-  read({ axes }, { metadata, cameras }) {
+  read(header, { metadata, cameras }) {
+    const { axes } = header;
     this.facts = {
       up: unitDirection(metadata?.up),
       axes,
@@ -139,11 +127,14 @@ export class CameraList {
     };
     this.up = this.#firstUp();
     this.shown = this.first;
+    this.ball = ballOf(header);
+    const axesOf = { ...header, axes: this.wanted.axes ?? axes };
+    this.firstCamera = firstView(axesOf, { metadata: metadata ?? null, cameras }, this.up);
   }
 
-  /** Whether the up direction is known from the file or the cameras of its photographs, or estimated. */
+  /** Whether the up direction is known from the file or the cameras of its photographs. */
   get knowsUp() {
-    return (this.#namedUp() ?? this.seems) !== null;
+    return this.#namedUp() !== null;
   }
 
   /** @returns {Vec3 | null} up direction in the file, regardless of its cameras */
@@ -163,35 +154,40 @@ export class CameraList {
     return known.length ? upOfCameras(known) : null;
   }
 
+  /** Whether the scene has been turned to another up direction than the file's. */
+  get isTurned() {
+    return dot(this.up, this.#firstUp()) <= SAME;
+  }
+
   #firstUp() {
-    return this.#namedUp() ?? this.seems ?? directionOf(DEFAULT_AXES, 'U');
+    return this.#namedUp() ?? directionOf(DEFAULT_AXES, 'U');
   }
 
   /**
-   * Place the camera for the initial view: once roughly, once finally, never after the user has moved it.
+   * Place the camera for the first view when the header is here, never after the user has moved it. When samples of the splats
+   * arrive, the view stays, and its pivot comes to lie on the surface.
    *
    * @param {Bounds} bounds
-   * @param {number} splatCount
-   * @param {boolean} atOnce without animation, if nothing is visible yet
-   * @returns {boolean} whether it was moved
+   * @returns {boolean} whether the camera was placed
    */
-  place(bounds, splatCount, atOnce) {
-    if (!this.waits || bounds === this.bounds) return false;
+  place(bounds) {
+    if (bounds === this.bounds) return false;
+    const isPlaced = this.bounds !== null;
     this.bounds = bounds;
-    this.splatCount = splatCount;
-    this.waits = bounds.coarse;
-    const pose = this.#firstPose(bounds, splatCount);
-    this.rig.home = pose;
+    if (isPlaced && this.controls.touched) return false;
+    this.rig.extent = this.ball.radius;
+    this.rig.home = this.#firstPose();
     if (this.controls.touched) return false;
-    this.controls.glide(pose, atOnce || pose.viewmat !== undefined);
-    return true;
+    if (isPlaced) this.rig.pose = this.rig.home;
+    else this.controls.glide(this.rig.home, true);
+    return !isPlaced;
   }
 
   /** Show the initial view at once, if the scene has been placed. */
   showFirst() {
     if (!this.bounds) return;
     this.shown = this.first;
-    this.rig.home = this.#firstPose(this.bounds, this.splatCount);
+    this.rig.home = this.#firstPose();
     this.controls.glide(this.rig.home, true);
   }
 
@@ -213,24 +209,21 @@ export class CameraList {
     this.shown = (this.shown + step + cameras.length) % cameras.length;
     const camera = cameras[this.shown];
     this.controls.touched = true;
-    this.controls.glide(cameraPose(camera, bounds, findFrame(bounds, this.up), this.up));
+    this.controls.glide(this.#poseOf(camera));
     return `Camera ${this.shown + 1} of ${cameras.length}${camera.image ? `: ${camera.image}` : ''}`;
   }
 
   /**
-   * Turn the scene to the next up direction and show its front.
+   * Turn the scene to the next up direction.
    *
-   * @param {Bounds} bounds
-   * @param {number} splatCount
    * @returns {{up: Vec3, isSaid: boolean}} the up direction, and whether it is the one in the file
    */
-  turnUpright(bounds, splatCount) {
+  turnUpright() {
     const all = waysUp(this.#firstUp());
     this.up = all[(all.findIndex((up) => dot(up, this.up) > SAME) + 1) % all.length];
-    const pose = this.#automatic(bounds, splatCount, this.up);
-    this.rig.home = pose;
+    this.rig.home = this.rig.limited(this.rig.turnedUp(this.up));
     this.controls.touched = true;
-    this.controls.glide(pose);
+    this.controls.glide(this.rig.home);
     return { up: this.up, isSaid: this.saidUp !== null && dot(this.saidUp, this.up) > SAME };
   }
 
@@ -248,31 +241,29 @@ export class CameraList {
     return point && this.rig.towards(point);
   }
 
-  /**
-   * @param {Bounds} bounds
-   * @param {number} splatCount
-   * @returns {Pose}
-   */
-  #firstPose(bounds, splatCount) {
-    const frame = findFrame(bounds, this.up);
-    this.rig.extent = frame.extent;
-    const camera = this.wantedCameras[this.first] ?? this.facts.start ?? this.cameras[0];
-    if (camera) return cameraPose(camera, bounds, frame, this.up);
-    return this.#automatic(bounds, splatCount, this.up);
+  /** @returns {Pose} that of the address, of the file, or the estimate from the header, within the limits of the controls */
+  #firstPose() {
+    const wanted = this.wantedCameras[this.first];
+    if (wanted) return this.#poseOf(wanted);
+    const first = /** @type {import('../../codec/js/first_view.mjs').FirstView} */ (this.firstCamera);
+    return first.isFound ? this.#poseOf(first) : this.rig.limited(this.#poseOf(first, null));
   }
 
   /**
-   * @param {Bounds} bounds
-   * @param {number} splatCount
-   * @param {Vec3} up
+   * Return the pose of a camera. Its pivot is on the surface that it looks at.
+   *
+   * @param {FileCamera} camera
+   * @param {Bounds | null} bounds with samples of the surface; null: the pivot is as far away as the middle of the scene
+   * @returns {Pose}
    */
-  #automatic(bounds, splatCount, up) {
-    const named = this.wanted.axes ?? this.facts.axes;
-    const axes = named && dot(directionOf(named, 'U'), up) > Math.SQRT1_2 ? named : ''; // the front is unknown for another up direction
-    const front = frontFor(axes || DEFAULT_AXES, up);
-    const { pose, frame } = automaticPose(bounds, splatCount, { up, front, isFrontKnown: axes !== '' });
-    this.rig.extent = frame.extent;
-    return this.rig.limited(pose);
+  #poseOf(camera, bounds = this.bounds) {
+    const { viewmat: m, lens, near } = camera;
+    const { ball, up } = this;
+    const basis = /** @type {Basis} */ ([0, 4, 8].map((at) => m.slice(at, at + 3)));
+    const { eye, distance } = eyeOf(camera, ball);
+    const seen = bounds && pick(bounds, { viewmat: m, ...lens, near }, lens.W / 2, lens.H / 2);
+    const depth = seen ? dot(sub(seen, eye), basis[2]) : 0;
+    return { basis, eye, distance: depth > 0.05 * ball.radius ? depth : distance, up, lens, near, viewmat: m };
   }
 }
 

@@ -8,6 +8,8 @@
 
 export const DEFAULT_NEAR = 0.2;
 
+const FLOAT_MAX = 3.4e38; // of binary32, rounded down
+
 /** Added to both variances of the projected covariance, in square pixels. */
 export const DILATION = 0.3;
 
@@ -85,6 +87,20 @@ export function toCamera(m, p) {
     m[4] * p[0] + m[5] * p[1] + m[6] * p[2] + m[7],
     m[8] * p[0] + m[9] * p[1] + m[10] * p[2] + m[11],
   ];
+}
+
+/**
+ * Write the corners of tiles in camera coordinates, computed in binary64 to avoid jitter far from the origin, and their steps.
+ *
+ * @param {{corner: number[], step: number}[]} tiles
+ * @param {ArrayLike<number>} viewmat
+ * @param {Float32Array} out [4 × tiles]
+ */
+export function putCorners(tiles, viewmat, out) {
+  for (const [tile, { corner, step }] of tiles.entries()) {
+    const place = corner.map((n) => n * step);
+    out.set([...toCamera(viewmat, place), Math.min(step, FLOAT_MAX)], 4 * tile);
+  }
 }
 
 /**

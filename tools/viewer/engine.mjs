@@ -372,10 +372,10 @@ class SplatEngine {
     return encodeImage(pixels, view, type, quality);
   }
 
-  /** @param {[number, number, number]} up */
-  fileWithUp(up) {
+  /** @param {import('./types.d.ts').MetadataChanges} changes */
+  fileWith(changes) {
     const { port1, port2 } = new MessageChannel();
-    this.worker.postMessage({ type: 'rewrite', up, port: port2 }, [port2]);
+    this.worker.postMessage({ type: 'rewrite', changes, port: port2 }, [port2]);
     return new Promise((/** @type {(bytes: Uint8Array<ArrayBuffer>) => void} */ resolve, reject) => {
       port1.onmessage = (/** @type {{data: import('./worker.mjs').Rewritten}} */ { data: { bytes, error } }) => {
         port1.close();
@@ -443,8 +443,9 @@ class SplatEngine {
       this.tell({ type: 'stop' });
       this.fail(error);
     }
+    if (reply.type === 'geometry' || reply.type === 'band') this.tell({ type: 'placed', scene: reply.scene });
     if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
-    if (['header', 'band', 'cut', 'order', 'done'].includes(reply.type)) this.requestFrame();
+    if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
     this.wake();
   }
 

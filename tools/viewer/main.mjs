@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: an engine, a camera that the user moves, and the overlay.
 //
-// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
+// Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // &controls=none&backend=webgl2
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
 import { E_CONTEXT, E_INPUT } from './engine_error.mjs';
 import { MeasureCard, measure } from './measure.mjs';
-import { SaveUpOffer, upWord } from './save_up.mjs';
+import { SaveOffer, upWord } from './save_offer.mjs';
 import { Overlay, element } from './overlay.mjs';
 import { embedded, nameOf, readWishes } from './page.mjs';
 import { SceneViewer } from './viewer.mjs';
@@ -23,10 +23,10 @@ const address = Object.fromEntries(new URLSearchParams(location.search));
 const { wishes, complaints } = readWishes(new URLSearchParams({ ...page?.wishes, ...address }));
 const canvas = element('canvas', HTMLCanvasElement);
 const overlay = new Overlay({ open: (file) => void show(file, file.name) });
-const keep = new SaveUpOffer({
-  file: async (up) => {
+const keep = new SaveOffer({
+  file: async (changes) => {
     if (!showing.engine) throw new Error('no scene is loaded');
-    return showing.engine.fileWithUp(up);
+    return showing.engine.fileWith(changes);
   },
   say: (text) => overlay.toast(text),
 });
@@ -120,12 +120,18 @@ function shDegree(degree) {
 function turnUpright() {
   const { engine } = showing;
   if (!engine?.bounds) return;
-  const { up, isSaid } = view.turnUpright(engine.bounds, engine.stats.splatCount);
+  const { up, isSaid } = view.turnUpright();
   element('upright', HTMLElement).hidden = false; // allows turning the scene further
   if (isSaid) {
     keep.hide();
     overlay.toast(`${upWord(up).replace('-', '−')} is up, as in the file`);
-  } else keep.show(overlay.name, up);
+  } else keep.show(overlay.name, { up });
+}
+
+/** Offer the current camera as the first view of the file. */
+function keepView() {
+  const { camera } = showing;
+  if (camera) keep.show(overlay.name, { view: camera, ...(view.isTurned && { up: view.up }) });
 }
 
 async function measureFrames() {
@@ -158,6 +164,7 @@ const ACTIONS = {
   KeyM: () => void measureFrames(),
   KeyO: () => overlay.chooseFile(),
   KeyU: turnUpright,
+  KeyV: keepView,
   KeyB: () => otherBackground(1),
   BracketLeft: () => otherCamera(-1),
   BracketRight: () => otherCamera(1),
@@ -179,6 +186,7 @@ const BUTTONS = {
   previous: 'BracketLeft',
   next: 'BracketRight',
   'help-upright': 'KeyU',
+  'help-view': 'KeyV',
   'help-background': 'KeyB',
   'help-measure': 'KeyM',
 };

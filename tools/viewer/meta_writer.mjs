@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Writes an up direction to META of a file (spec 5.4). Index and header are updated, everything else is copied.
+// Writes an up direction and a first view to META of a file (spec 5.4). Index and header are updated, everything else is copied.
 
 import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
 import { CsplatReader } from '../../codec/js/decoder.mjs';
@@ -17,14 +17,14 @@ const AXIS_AGREES = Math.SQRT1_2; // cosine of 45 degrees; beyond it another axi
 const HEADER_FIXED = AT_HEADER.header_crc;
 
 /**
- * Write `up` to the metadata. Axes that contradict it are removed, and so are chunks of unknown type that are not safe to
- * copy (CHK-5).
+ * Write `up`, `view` or both to the metadata. Axes and an estimated view that contradict `up` are removed, and so are chunks of
+ * unknown type that are not safe to copy (CHK-5).
  *
  * @param {ArrayBuffer} bytes a file
- * @param {number[]} up unit vector
+ * @param {import('./types.d.ts').MetadataChanges} changes
  * @returns {Promise<Uint8Array<ArrayBuffer>>} the new file
  */
-export async function withUp(bytes, up) {
+export async function withMetadata(bytes, { up, view: first }) {
   const reader = await CsplatReader.open(bytes);
   const { header } = reader;
   const { metadata } = await reader.describe();
@@ -33,7 +33,8 @@ export async function withUp(bytes, up) {
   );
   const before = directory.find(({ type }) => type === spec.CHUNK_METADATA);
   const flags = before?.flags ?? registeredFlags(spec.CHUNK_METADATA);
-  const meta = metadataChunk(withoutEstimate({ ...metadata, up }), flags);
+  const kept = up ? { ...withoutEstimates(metadata ?? {}), up } : metadata;
+  const meta = metadataChunk(first ? { ...kept, view: { ...first, from: 'author' } } : (kept ?? {}), flags);
 
   const source = new Uint8Array(bytes);
   const index = source.slice(0, spec.HEADER_SIZE + header.indexSize - CRC_SIZE); // includes the header
@@ -49,8 +50,8 @@ export async function withUp(bytes, up) {
     ...allTiles(header).flatMap(({ layers }) => layers),
   ];
   const tree = directory.find(({ type }) => type === spec.CHUNK_TREE);
-  const first = before?.offset ?? (tree ? tree.offset + tree.size : 0); // a new META chunk comes first, or after TREE
-  const chunks = [{ offset: first, bytes: meta, field: 0 }];
+  const place = before?.offset ?? (tree ? tree.offset + tree.size : 0); // a new META chunk comes first, or after TREE
+  const chunks = [{ offset: place, bytes: meta, field: 0 }];
   for (const { offset, size, offsetField } of others) {
     chunks.push({ offset, bytes: source.subarray(offset, offset + size), field: offsetField });
   }
@@ -68,7 +69,7 @@ export async function withUp(bytes, up) {
   if (!before) records.push(record);
   putRecord(record, flags, meta, metaAt);
   const axesAt = spec.HEADER_SIZE + AT_INDEX.axes;
-  if (!isUpright(header.axes, up)) index.fill(spec.DIRECTION_UNSPECIFIED, axesAt, axesAt + 3);
+  if (up && !isUpright(header.axes, up)) index.fill(spec.DIRECTION_UNSPECIFIED, axesAt, axesAt + 3);
   view.setUint16(spec.HEADER_SIZE + AT_INDEX.directory_count, count, true);
   const tiles = allTiles(header);
   const roots = (await reader.nodes()).filter(({ parent }) => parent === null);
@@ -85,11 +86,13 @@ export async function withUp(bytes, up) {
 }
 
 /**
- * Return metadata whose up direction is no estimate.
+ * Return metadata without an estimated view, whose up direction is no estimate.
  *
  * @param {Record<string, unknown>} metadata
  */
-function withoutEstimate({ estimated, ...others }) {
+export function withoutEstimates({ estimated, view, ...rest }) {
+  const isEstimate = /** @type {any} */ (view)?.from === 'estimate';
+  const others = view === undefined || isEstimate ? rest : { ...rest, view };
   if (!Array.isArray(estimated)) return estimated === undefined ? others : { ...others, estimated };
   const keys = estimated.filter((key) => key !== spec.META_KEY_UP);
   return keys.length ? { ...others, estimated: keys } : others;

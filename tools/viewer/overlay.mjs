@@ -67,7 +67,7 @@ export class Overlay {
     html('error-close').addEventListener('click', () => this.hideError());
     html('details').addEventListener('click', () => this.toggleStatistics());
     html('help').addEventListener('click', () => this.toggleHelp());
-    for (const id of ['help-close', 'help-upright', 'help-background', 'help-measure']) {
+    for (const id of ['help-close', 'help-upright', 'help-view', 'help-background', 'help-measure']) {
       html(id).addEventListener('click', () => this.toggleHelp());
     }
     const input = element('file', HTMLInputElement);

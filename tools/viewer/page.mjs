@@ -10,7 +10,6 @@ import { unitDirection } from './vectors.mjs';
  * @property {string | null} camera a camera, a list of cameras, or the address of a file with one or the other
  * @property {number} view index of the camera in the list
  * @property {import('./vectors.mjs').Vec3 | null} up up direction, a unit vector; overrides the file's
- * @property {import('./vectors.mjs').Vec3 | null} seems up direction if nothing else specifies it
  * @property {string | null} axes directions of +x, +y, +z; override the file's
  * @property {{width: number, height: number} | null} size size of the drawing buffer, pixels
  * @property {import('./types.d.ts').Background | null} background overrides the file's
@@ -80,7 +79,6 @@ export function readWishes(query) {
       camera: query.get('camera'),
       view: Number(view?.[0] ?? 0),
       up: direction('up'),
-      seems: direction('seems'),
       axes: axes?.[0] ?? null,
       size: size && { width: Number(size[1]), height: Number(size[2]) },
       background: colour && /** @type {any} */ (colour[1] ? colour.slice(1).map(share) : 'transparent'),

@@ -34,6 +34,19 @@ import { WebGpuRenderer } from './webgpu.mjs';
  *
  * @typedef {{background: number[], shDegree: number}} Look
  *
+ * The memory of a scene on the GPU.
+ *
+ * @typedef {object} SceneMemory
+ * @property {(tile: number, texels: import('./texels.mjs').GeometryTexels, slot: number) => void} putGeometry layer 0
+ *   of a tile, and the slot of its first splat
+ * @property {(tile: number) => void} evict free the memory of a tile, which the order has no splats of
+ * @property {(codebook: number, layer: number, rows: import('./texels.mjs').Rows) => void} putTable entries of a codebook
+ * @property {(tile: number, layer: number, band: import('./texels.mjs').BandTexels) => void} putBand an SH band of a
+ *   tile, after the table it refers to; a codebook's lowest band first
+ * @property {(order: Uint32Array, count: number) => void} putOrder slots, farthest first, for renderers that do not sort
+ * @property {(shares: Map<number, number>) => void} setShares the tiles to draw, and their shares, see `fadedAlpha`; all of
+ *   all tiles if it is never called
+ *
  * Draws splats, each in a slot. The order must not contain splats that are not there. All methods but `dispose` may do nothing after the context or the GPU is lost.
  *
  * @typedef {object} Renderer
@@ -41,15 +54,8 @@ import { WebGpuRenderer } from './webgpu.mjs';
  * @property {Bytes} bytes
  * @property {(scene: SceneLayout) => void} allocate replace the previous scene and allocate memory for a new one; throws
  *   a RangeError if there is not enough
- * @property {(tile: number, texels: import('./texels.mjs').GeometryTexels, slot: number) => void} uploadGeometry layer 0
- *   of a tile, and the slot of its first splat
- * @property {(tile: number) => void} evict free the memory of a tile, which the order has no splats of
- * @property {(codebook: number, layer: number, rows: import('./texels.mjs').Rows) => void} uploadTable entries of a codebook
- * @property {(tile: number, layer: number, band: import('./texels.mjs').BandTexels) => void} uploadBand an SH band of a
- *   tile, after the table it refers to; a codebook's lowest band first
+ * @property {SceneMemory | null} scene
  * @property {() => void} complete everything has been uploaded: free reserved memory
- * @property {(order: Uint32Array, count: number) => void} setOrder slots, farthest first
- * @property {(tiles: Uint32Array) => void} setCut the tiles to draw, for renderers that sort; all if it is never called
  * @property {(view: import('./types.d.ts').View, look: Look) => void} draw to the canvas, which has the size of the view
  * @property {(view: import('./types.d.ts').View, look: Look) => Uint8Array<ArrayBuffer> | Promise<Uint8Array<ArrayBuffer>>} pixelsOf draw a picture of
  *   any size and return it: RGBA, premultiplied, top row first; empty if the GPU is lost. Throws a RangeError if there is not

@@ -76,12 +76,11 @@ export class SceneLoad {
     else if (reply.type === 'progress') this.#takeProgress(reply);
     else if (reply.type === 'geometry') this.#takeGeometry(reply, renderer);
     else if (reply.type === 'evict') {
-      renderer.evict(reply.tile);
+      renderer.scene?.evict(reply.tile);
       this.stats.splatsResident -= this.resident.get(reply.tile) ?? 0;
       this.resident.delete(reply.tile);
-    } else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
-    else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
-    else if (reply.type === 'cut') renderer.setCut(reply.tiles);
+    } else if (reply.type === 'table') renderer.scene?.putTable(reply.codebook, reply.layer, reply.rows);
+    else if (reply.type === 'band') renderer.scene?.putBand(reply.tile, reply.layer, reply.band);
     else if (reply.type === 'order') this.#takeOrder(reply, renderer);
     else if (reply.type === 'error') {
       if (reply.error.fatal) throw new EngineError(reply.error);
@@ -120,6 +119,7 @@ export class SceneLoad {
         opacitySquare: opacities.mapping === 'square',
         quatLevels: quats.levels,
       });
+      renderer.scene?.setShares(new Map());
     } catch (error) {
       if (error instanceof RangeError) throw new EngineError({ code: E_LIMIT, message: error.message });
       throw error;
@@ -143,7 +143,7 @@ export class SceneLoad {
    * @param {Renderer} renderer
    */
   #takeGeometry({ tile, slot, texels, samples }, renderer) {
-    renderer.uploadGeometry(tile, texels, slot);
+    renderer.scene?.putGeometry(tile, texels, slot);
     this.resident.set(tile, texels.count);
     this.stats.splatsResident += texels.count;
     if (!this.header || samples.weights.length === 0) return;
@@ -156,8 +156,9 @@ export class SceneLoad {
    * @param {Reply & {type: 'order'}} reply
    * @param {Renderer} renderer
    */
-  #takeOrder({ id, isComplete, isWhole, order, count, cullMs, sortMs }, renderer) {
-    renderer.setOrder(order, count);
+  #takeOrder({ id, isComplete, isWhole, shares, order, count, cullMs, sortMs }, renderer) {
+    if (shares) renderer.scene?.setShares(shares);
+    renderer.scene?.putOrder(order, count);
     this.order = { id, isComplete, isWhole };
     Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
   }

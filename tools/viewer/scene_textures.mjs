@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, and the order.
 
-import { toCamera } from './camera_maths.mjs';
+import { FADE_STEPS } from '../../codec/js/levels/shown_tiles.mjs';
+import { putCorners } from './camera_maths.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
 import { UNITS } from './shader_programs.mjs';
-import { BAND_CODEBOOK, BAND_ROWS, tileTexels } from './shader_attributes.mjs';
+import { FADE_SHIFT, bandConstants, tileTexels } from './shader_attributes.mjs';
 import { Records } from './framebuffers.mjs';
 import { LinearTexture, Store, formats } from './textures.mjs';
 
@@ -93,22 +94,12 @@ export class SceneTextures {
    * @param {BandTexels} band
    */
   putBand(tile, layer, { rows, codebook }) {
-    const at = 4 * (this.tileTexels * tile + 1 + 2 * layer);
     const rowsAt = rows ? this.#append(tile, rows.texels) : 0;
-    const rowBits = rows ? rows.bits : 1;
     const table = codebook && this.tables.get(`${codebook.id}.${layer}`);
-    if (!codebook || !table) {
-      this.constants.set([BAND_ROWS | (rowBits << 16), 0, 0, rowsAt], at);
-      this.constantFloats.set([0, rows ? rows.offset : 0, rows ? rows.step : 0], at + 4);
-    } else {
-      const key = `${tile}.${codebook.id}`; // all bands of a codebook have the same indices
-      let indexAt = this.indices.get(key);
-      if (indexAt === undefined) this.indices.set(key, (indexAt = this.#append(tile, codebook.index)));
-      const bits = (codebook.indexBits << 2) | (table.rows.bits << 8) | (rowBits << 16);
-      this.constants.set([BAND_CODEBOOK | bits, indexAt, table.at, rowsAt], at);
-      this.constantFloats.set([table.rows.offset, rows ? rows.offset : 0, table.rows.step], at + 4);
-      this.constants[at + 7] = codebook.size;
-    }
+    const key = `${tile}.${codebook?.id}`; // all bands of a codebook have the same indices
+    if (codebook && !this.indices.has(key)) this.indices.set(key, this.#append(tile, codebook.index));
+    const words = bandConstants({ rows, codebook }, table, rowsAt, this.indices.get(key));
+    this.constants.set(words, 4 * (this.tileTexels * tile + 1 + 2 * layer));
     this.putConstants(tile);
   }
 
@@ -133,6 +124,17 @@ export class SceneTextures {
     this.constants.fill(0, first, first + 4 * this.tileTexels);
   }
 
+  /** @param {Map<number, number>} shares of the tiles that are drawn */
+  setShares(shares) {
+    for (const [tile, some] of shares) {
+      const at = 4 * this.tileTexels * tile;
+      const word = (this.constants[at] % 2 ** FADE_SHIFT) + (FADE_STEPS - some) * 2 ** FADE_SHIFT;
+      if (word === this.constants[at]) continue;
+      this.constants[at] = word;
+      this.putConstants(tile);
+    }
+  }
+
   /** @param {number} tile */
   putConstants(tile) {
     const first = this.tileTexels * tile;
@@ -149,23 +151,10 @@ export class SceneTextures {
     this.count = count;
   }
 
-  /**
-   * Write the corners of tiles in camera coordinates, computed in binary64 to avoid jitter far from the origin.
-   *
-   * @param {View} view
-   */
+  /** Write the corners of tiles, see `putCorners`. @param {View} view */
   putPlaces({ viewmat }) {
     const { corners, layout } = this;
-    layout.tiles.forEach(({ corner, step }, tile) => {
-      corners.set(
-        toCamera(
-          viewmat,
-          corner.map((n) => n * step),
-        ),
-        4 * tile,
-      );
-      corners[4 * tile + 3] = step;
-    });
+    putCorners(layout.tiles, viewmat, corners);
     this.places.write(0, corners);
   }
 

@@ -15,6 +15,34 @@ export const BAND_NONE = 0;
 export const BAND_ROWS = 1;
 export const BAND_CODEBOOK = 2;
 
+/** Position, in the first word of a tile's constants, of the shares of its optical depth that are not drawn. */
+export const FADE_SHIFT = 25;
+
+/**
+ * Return the eight words of a tile's constants for an SH band, in both back ends.
+ *
+ * @param {import('./texels.mjs').BandTexels} band
+ * @param {{at: number, rows: import('./texels.mjs').Rows} | null | undefined} table of its codebook
+ * @param {number} rowsAt where its rows are
+ * @param {number} [indexAt] where its indices are
+ */
+export function bandConstants({ rows, codebook }, table, rowsAt, indexAt = 0) {
+  const words = new Uint32Array(8);
+  const floats = new Float32Array(words.buffer);
+  const rowBits = (rows ? rows.bits : 1) << 16;
+  if (codebook && table) {
+    const { rows: entries, at } = table;
+    const bits = (codebook.indexBits << 2) | (entries.bits << 8) | rowBits;
+    words.set([BAND_CODEBOOK | bits, indexAt, at, rowsAt]);
+    floats.set([entries.offset, rows?.offset ?? 0, entries.step], 4);
+    words[7] = codebook.size;
+  } else {
+    words.set([BAND_ROWS | rowBits, 0, 0, rowsAt]);
+    floats.set([0, rows?.offset ?? 0, rows?.step ?? 0], 4);
+  }
+  return words;
+}
+
 /** Reads the fields of a splat in order. */
 export const READ_GEOMETRY = `
 uniform usampler2D uFirst; // first texel of each splat

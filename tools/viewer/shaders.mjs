@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // The shaders. A fragment pass projects the splats in order, one per pixel, into records; quads are drawn from the records.
 
+import { FADE_EXCESS, FADE_STEPS } from '../../codec/js/levels/shown_tiles.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
-import { COLOUR, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS } from './shader_attributes.mjs';
+import { COLOUR, FADE_SHIFT, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS } from './shader_attributes.mjs';
 
 const HEAD = `#version 300 es
 precision highp float;
@@ -94,6 +95,8 @@ void main() {
   if (!(p.z > uNear)) return;
   float opacity = float(field((layout0.x >> 20) & 31u)) / uOpacityLevels;
   if (uOpacitySquare) opacity *= opacity;
+  float hidden = float(layout0.x >> ${FADE_SHIFT}) / ${FADE_STEPS}.0; // of a tile that fades, see fadedAlpha
+  opacity *= (1.0 - hidden) * (1.0 + ${FADE_EXCESS} * opacity * hidden);
   if (!(opacity >= ${1 / 255})) return;
   vec3 logScales = values(layout0.y & 63u, scaleLattice);
   vec3 quat = field3((layout0.x >> 15) & 31u);

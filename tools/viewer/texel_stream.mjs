@@ -21,9 +21,9 @@ import { BLOCK_SPLATS, packBand, packGeometry, packRows, pagesOf } from './texel
  *
  * @typedef {object} TexelSink
  * @property {(opened: Opened) => void} header
- * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry
+ * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void | Promise<void>} geometry
  * @property {(codebook: number, layer: number, rows: Rows) => void} table
- * @property {(tile: number, layer: number, band: BandTexels) => void} band
+ * @property {(tile: number, layer: number, band: BandTexels) => void | Promise<void>} band
  * @property {(tile: number) => void} evict the tile is no longer here
  * @property {(progress: Amounts) => void} progress
  * @property {(error: unknown) => void} warn reports an error that leaves the scene usable: a damaged tile, for which a
@@ -131,7 +131,7 @@ export class TexelStream {
     const culled = cullTile(packed, alphas, tile, slot);
     this.here.set(index, culled);
     const samples = this.tiles.roots.has(index) ? samplesOf(packed, alphas, this.stride) : noSamples();
-    sink.geometry(index, texels, culled, samples);
+    return sink.geometry(index, texels, culled, samples);
   }
 
   /**
@@ -146,7 +146,7 @@ export class TexelStream {
       if (!this.tables.has(key)) sink.table(sh.lookup.codebook, layer, packRows(sh.lookup.table));
       this.tables.add(key);
     }
-    sink.band(index, layer, packBand(sh, count));
+    return sink.band(index, layer, packBand(sh, count));
   }
 }
 

@@ -34,7 +34,7 @@ const PIXELS = [
  */
 export function warmUp(renderer) {
   const view = putTrialScene(renderer);
-  renderer.setOrder(Uint32Array.of(0, 1), BALLS.length);
+  renderer.scene?.putOrder(Uint32Array.of(0, 1), BALLS.length);
   for (let time = 0; time < 2; time++) {
     renderer.draw(view, { background: [0, 0, 0, 1], shDegree: 0 });
     renderer.allocate(null);
@@ -89,7 +89,7 @@ function putTrialScene(renderer) {
   const tiles = [{ splatCount: BALLS.length, corner: [0, 0, 0], step: 1 }];
   const { pages } = pagesOf(tiles, Infinity);
   renderer.allocate({ ...layout, shDegree: 0, tiles, pages, drawn: BALLS.length });
-  renderer.uploadGeometry(0, packGeometry(geometry, { levels: LEVELS }, { levels: LEVELS }), 0);
+  renderer.scene?.putGeometry(0, packGeometry(geometry, { levels: LEVELS }, { levels: LEVELS }), 0);
   const half = SIZE / 2;
   return { viewmat: IDENTITY, fx: FOCAL, fy: FOCAL, cx: half, cy: half, width: SIZE, height: SIZE, near: 0.2 };
 }

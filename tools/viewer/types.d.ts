@@ -24,6 +24,12 @@ export interface View extends Required<Camera> {
 }
 
 /** The bounds of a scene, for an automatic camera; in scene units, relative to the header's origin. */
+/** An up direction, a unit vector, and a first view for the metadata of a file. */
+export interface MetadataChanges {
+  up?: [number, number, number];
+  view?: FileCamera;
+}
+
 export interface Bounds {
   /** Centre of the visible weight. */
   centre: [number, number, number];
@@ -191,8 +197,8 @@ export interface Engine {
    * pixels than possible, E_REPLACED if another scene is opened, E_CONTEXT if the GPU is lost, or that of the scene.
    */
   toBlob(options?: PictureOptions): Promise<Blob>;
-  /** Return the scene's file with an up direction, a unit vector, in its metadata. */
-  fileWithUp(up: [number, number, number]): Promise<Uint8Array<ArrayBuffer>>;
+  /** Return the scene's file with other metadata. */
+  fileWith(changes: MetadataChanges): Promise<Uint8Array<ArrayBuffer>>;
   /**
    * Draw frames, waiting after each or after so many together, and return the milliseconds per frame of each wait. For
    * benchmarks.

@@ -2,8 +2,8 @@
 // The viewer: an engine, a camera with its controls, and a canvas that follows the page's size. The page (main.mjs) and the
 // element (element.mjs) are built on it.
 
+import { readCamera } from '../../codec/js/first_view.mjs';
 import { Controls } from './controls.mjs';
-import { readCamera } from './autocamera.mjs';
 import { completeSize, fitCamera } from './camera_maths.mjs';
 import { createEngine } from './engine.mjs';
 import { E_INPUT, E_REPLACED, EngineError } from './engine_error.mjs';
@@ -112,7 +112,7 @@ export class SceneViewer {
         },
         onProgress: (progress) => {
           hooks.progress(progress);
-          if (this.view.waits) this.#place();
+          this.#place();
         },
         onFrame: (stats) => {
           this.stage.drawn(stats.frameMs);
@@ -241,12 +241,11 @@ export class SceneViewer {
     engine.requestFrame();
   }
 
-  /** Place the camera according to what is known of the scene so far. */
+  /** Place the camera, or its pivot once samples of the splats are here. */
   #place() {
     const { engine } = this;
     if (!engine?.bounds || !engine.header) return;
-    const { splatCount, splatsDrawn } = engine.stats;
-    if (this.view.place(engine.bounds, splatCount, splatsDrawn === 0)) this.draw();
+    if (this.view.place(engine.bounds)) this.draw();
     this.hooks.placed?.();
   }
 

@@ -10,9 +10,6 @@ import { warmUp } from './trial_scene.mjs';
 import { SOFTWARE } from './webgpu_device.mjs';
 
 /**
- * @typedef {import('./texels.mjs').BandTexels} BandTexels
- * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
- * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./renderer.mjs').Capabilities} Capabilities
  * @typedef {import('./renderer.mjs').Renderer} Renderer
  * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
@@ -75,51 +72,9 @@ export class WebGl2Renderer {
     if (layout) this.scene = new SceneTextures(this.gl, layout, this.capabilities.splatsMax);
   }
 
-  /**
-   * @param {number} tile
-   * @param {GeometryTexels} texels
-   * @param {number} slot
-   */
-  uploadGeometry(tile, texels, slot) {
-    this.scene?.putGeometry(tile, texels, slot);
-  }
-
-  /** @param {number} tile */
-  evict(tile) {
-    this.scene?.evict(tile);
-  }
-
-  /**
-   * @param {number} codebook
-   * @param {number} layer
-   * @param {Rows} rows
-   */
-  uploadTable(codebook, layer, rows) {
-    this.scene?.putTable(codebook, layer, rows);
-  }
-
-  /**
-   * @param {number} tile
-   * @param {number} layer
-   * @param {BandTexels} band
-   */
-  uploadBand(tile, layer, band) {
-    this.scene?.putBand(tile, layer, band);
-  }
-
   complete() {
     this.scene?.store.trim();
   }
-
-  /**
-   * @param {Uint32Array} order
-   * @param {number} count
-   */
-  setOrder(order, count) {
-    this.scene?.putOrder(order, count);
-  }
-
-  setCut() {}
 
   /**
    * @param {View} view

@@ -13,9 +13,6 @@ import { ScreenTiles } from './webgpu_tiles.mjs';
 import * as WGSL from './wgsl.mjs';
 
 /**
- * @typedef {import('./texels.mjs').BandTexels} BandTexels
- * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
- * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./renderer.mjs').Capabilities} Capabilities
  * @typedef {import('./renderer.mjs').Losses} Losses
  * @typedef {import('./renderer.mjs').Renderer} Renderer
@@ -146,48 +143,9 @@ export class WebGpuRenderer {
     projection.setScene(scene);
   }
 
-  /**
-   * @param {number} tile
-   * @param {GeometryTexels} texels
-   * @param {number} slot
-   */
-  uploadGeometry(tile, texels, slot) {
-    this.scene?.putGeometry(tile, texels, slot);
-  }
-
-  /** @param {number} tile */
-  evict(tile) {
-    this.scene?.evict(tile);
-  }
-
-  /**
-   * @param {number} codebook
-   * @param {number} layer
-   * @param {Rows} rows
-   */
-  uploadTable(codebook, layer, rows) {
-    this.scene?.putTable(codebook, layer, rows);
-  }
-
-  /**
-   * @param {number} tile
-   * @param {number} layer
-   * @param {BandTexels} band
-   */
-  uploadBand(tile, layer, band) {
-    this.scene?.putBand(tile, layer, band);
-  }
-
   complete() {
     this.scene?.trim();
     this.isWhole = true;
-  }
-
-  setOrder() {}
-
-  /** @param {Uint32Array} tiles */
-  setCut(tiles) {
-    this.scene?.setCut(tiles);
   }
 
   /**

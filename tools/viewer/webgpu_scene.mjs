@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // The memory of one scene on a WebGPU device. csplat_render/gpu/packing.py describes the layout.
 
-import { toCamera } from './camera_maths.mjs';
+import { FADE_STEPS } from '../../codec/js/levels/shown_tiles.mjs';
+import { putCorners } from './camera_maths.mjs';
+import { bandConstants } from './shader_attributes.mjs';
 import { BLOCK_SPLATS } from './texels.mjs';
 import { Words } from './webgpu_device.mjs';
 
@@ -24,11 +26,9 @@ const TILE_ROWS = 12;
 
 const TEXEL_WORDS = 4;
 const USUAL_WORDS = 5; // of a splat, at first
-const BAND_ROWS = 1;
-const BAND_CODEBOOK = 2;
-const FLOAT_MAX = 3.4e38;
 const SQUARED = 1 << 24;
 const ANTIALIASED = 1 << 25;
+const FADE_SHIFT = 26; // of the shares that are not drawn
 
 export class GpuScene {
   /**
@@ -60,8 +60,8 @@ export class GpuScene {
     this.indices = new Map();
     this.constants = new Uint32Array(TEXEL_WORDS * TILE_ROWS * tiles.length);
     this.places = new Float32Array(TEXEL_WORDS * tiles.length);
-    /** Which tiles are drawn; null for all. @type {Set<number> | null} */
-    this.cut = null;
+    /** Shares of the tiles that are drawn; null for all of all. @type {Map<number, number> | null} */
+    this.shares = null;
   }
 
   get bytes() {
@@ -154,20 +154,10 @@ export class GpuScene {
       return range.start;
     };
     const rowsAt = rows ? append(rows.texels) : 0;
-    const rowBits = rows ? rows.bits : 1;
     const table = codebook && this.tableOf.get(`${codebook.id}.${layer}`);
-    const head = 2 + 2 * layer;
-    if (!codebook || !table) {
-      this.#set(tile, head, [BAND_ROWS | (rowBits << 16), 0, 0, rowsAt]);
-      this.#setFloats(tile, head + 1, [0, rows ? rows.offset : 0, rows ? rows.step : 0], 0);
-    } else {
-      const key = `${tile}.${codebook.id}`; // all bands of a codebook have the same indices
-      let indexAt = this.indices.get(key);
-      if (indexAt === undefined) this.indices.set(key, (indexAt = append(codebook.index)));
-      const bits = (codebook.indexBits << 2) | (table.rows.bits << 8) | (rowBits << 16);
-      this.#set(tile, head, [BAND_CODEBOOK | bits, indexAt, table.at, rowsAt]);
-      this.#setFloats(tile, head + 1, [table.rows.offset, rows ? rows.offset : 0, table.rows.step], codebook.size);
-    }
+    const key = `${tile}.${codebook?.id}`; // all bands of a codebook have the same indices
+    if (codebook && !this.indices.has(key)) this.indices.set(key, append(codebook.index));
+    this.#set(tile, 2 + 2 * layer, bandConstants({ rows, codebook }, table, rowsAt, this.indices.get(key)));
     const second = TEXEL_WORDS * (TILE_ROWS * tile + 1) + 1;
     const degree = Math.max(layer, this.constants[second] >>> 24);
     this.constants[second] = (this.constants[second] & 0xffffff) | (degree << 24);
@@ -195,49 +185,29 @@ export class GpuScene {
     this.constants.set(words, TEXEL_WORDS * (TILE_ROWS * tile + row));
   }
 
-  /**
-   * @param {number} tile
-   * @param {number} row
-   * @param {number[]} floats
-   * @param {number} last
-   */
-  #setFloats(tile, row, floats, last) {
-    this.#set(tile, row, [...new Uint32Array(Float32Array.from(floats).buffer), last]);
-  }
-
   /** @param {number} tile */
   #putConstants(tile) {
     const words = TEXEL_WORDS * TILE_ROWS;
     const constants = this.constants.slice(words * tile, words * (tile + 1));
-    if (this.cut && !this.cut.has(tile)) constants[3] = 0; // no splats
+    const shares = this.shares ? (this.shares.get(tile) ?? 0) : FADE_STEPS;
+    constants[3] = shares === 0 ? 0 : constants[3] | ((FADE_STEPS - shares) << FADE_SHIFT); // 0: no splats
     this.#write(16 * (this.tileTable + TILE_ROWS * tile), constants);
   }
 
-  /** @param {Uint32Array} tiles the tiles to draw */
-  setCut(tiles) {
-    const before = this.cut;
-    this.cut = new Set(tiles);
+  putOrder() {}
+
+  /** @param {Map<number, number>} shares of the tiles to draw */
+  setShares(shares) {
+    const before = this.shares;
+    this.shares = shares;
     for (let tile = 0; tile < this.layout.tiles.length; tile++) {
-      if (before?.has(tile) !== this.cut.has(tile)) this.#putConstants(tile);
+      if (before === null || before.get(tile) !== shares.get(tile)) this.#putConstants(tile);
     }
   }
 
-  /**
-   * Write the corners of tiles in camera coordinates, computed in binary64 to avoid jitter far from the origin.
-   *
-   * @param {View} view
-   */
+  /** Write the corners of tiles, see `putCorners`. @param {View} view */
   place({ viewmat }) {
-    this.layout.tiles.forEach(({ corner, step }, tile) => {
-      this.places.set(
-        toCamera(
-          viewmat,
-          corner.map((n) => n * step),
-        ),
-        TEXEL_WORDS * tile,
-      );
-      this.places[TEXEL_WORDS * tile + 3] = Math.min(step, FLOAT_MAX);
-    });
+    putCorners(this.layout.tiles, viewmat, this.places);
     this.#write(0, this.places);
   }
 

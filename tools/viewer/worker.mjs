@@ -2,10 +2,10 @@
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
-import { chooseTiles } from '../../codec/js/levels/level_cut.mjs';
+import { STEP_MS, ShownTiles } from '../../codec/js/levels/shown_tiles.mjs';
 import { cull } from './cull.mjs';
 import { pageFunctions } from './fetch_port.mjs';
-import { withUp } from './meta_writer.mjs';
+import { withMetadata } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
 import { TexelStream } from './texel_stream.mjs';
 
@@ -20,8 +20,9 @@ import { TexelStream } from './texel_stream.mjs';
  *      aims: import('../../codec/js/levels/tile_stream.mjs').Aims, fetching: Fetching}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
+ *   | {type: 'placed', scene: number}
  *   | {type: 'pause', isPaused: boolean}
- *   | {type: 'rewrite', up: number[], port: MessagePort}
+ *   | {type: 'rewrite', changes: import('./types.d.ts').MetadataChanges, port: MessagePort}
  *   | {type: 'stop'}} Request
  *
  * How to fetch: options of the engine that can be sent, and whether the page has functions for the others.
@@ -37,22 +38,25 @@ import { TexelStream } from './texel_stream.mjs';
  *
  * @typedef {{scene: number} & (
  *   | {type: 'header', opened: import('./texel_stream.mjs').Opened}
- *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
  *   | {type: 'geometry', tile: number, slot: number, texels: import('./texels.mjs').GeometryTexels,
  *      samples: import('./texel_stream.mjs').Samples}
  *   | {type: 'evict', tile: number}
  *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
  *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
- *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
- *      cullMs: number, sortMs: number}
+ *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, shares: Map<number, number> | null,
+ *      order: Uint32Array<ArrayBuffer>, count: number, cullMs: number, sortMs: number}
  *   | {type: 'done'}
  *   | {type: 'ask', question: import('./fetch_port.mjs').Question, port: MessagePort}
  *   | {type: 'error', error: ErrorReport})} Reply
  *
- * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires was here. `done`:
- * so it was for the first time.
+ * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires is drawn, and
+ * nothing fades; `shares` of the tiles that are drawn, null if they have not changed. `done`: everything that a view requires was
+ * here for the first time.
  */
+
+/** Parts on their way to the page beyond which no others are decoded. */
+const UNPLACED = 8;
 
 /** Minimum interval between sorts while tiles arrive. */
 const SORT_INTERVAL_MS = 100;
@@ -78,12 +82,12 @@ class Job {
     this.stream = null;
     /** Tiles that are drawn. @type {CullTile[]} */
     this.drawn = [];
-    /** Nodes that finer ones are drawn for. @type {Set<number>} */
-    this.refined = new Set();
-    this.isWhole = false; // `drawn` covers the whole scene
+    /** @type {ShownTiles | null} */
+    this.shown = null;
     this.isDone = false; // everything that a view requires was here once
     this.isPaused = false;
-    this.splatCount = 0; // number of splats in `drawn`
+    this.unplaced = 0; // parts that the page has not received
+    this.resume = () => {};
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorts = true;
@@ -104,9 +108,11 @@ class Job {
     } else if (request.type === 'pause') {
       this.isPaused = request.isPaused;
       this.stream?.tiles.pause(this.isPaused);
-    } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
+    } else if (request.type === 'rewrite') this.rewrite(request.changes, request.port);
     else if (request.type === 'stop') this.reset();
-    else if (this.spare.length < 2) this.spare.push(request.order);
+    else if (request.type === 'placed') {
+      if (request.scene === this.scene && --this.unplaced < UNPLACED) this.resume();
+    } else if (this.spare.length < 2) this.spare.push(request.order);
   }
 
   /** Close the scene. */
@@ -116,9 +122,9 @@ class Job {
     this.abort = new AbortController();
     this.stream = null;
     this.drawn = [];
-    this.refined = new Set();
-    this.isWhole = this.isDone = false;
-    this.splatCount = 0;
+    this.shown = null;
+    this.isDone = false;
+    this.unplaced = 0;
     this.spare = [];
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     this.sorter = new DepthSorter();
@@ -141,6 +147,7 @@ class Job {
     try {
       const stream = await TexelStream.open(source, this.sink(post), aims, signal, this.fetching);
       this.stream = stream;
+      this.shown = new ShownTiles(stream.tiles);
       stream.tiles.pause(this.isPaused);
       stream.tiles.setView(this.camera?.view ?? null);
       await stream.tiles.failed;
@@ -150,15 +157,20 @@ class Job {
     }
   }
 
+  /** Resolves when the page has received most of what was sent, after another part. */
+  async room() {
+    if (++this.unplaced >= UNPLACED) await new Promise((/** @type {(value: void) => void} */ go) => (this.resume = go));
+  }
+
   /**
-   * Send the scene's file with another up direction.
+   * Send the scene's file with other metadata.
    *
-   * @param {number[]} up
+   * @param {import('./types.d.ts').MetadataChanges} changes
    * @param {MessagePort} port
    */
-  async rewrite(up, port) {
+  async rewrite(changes, port) {
     try {
-      const bytes = await withUp(await whole(this.source, this.fetching), up);
+      const bytes = await withMetadata(await whole(this.source, this.fetching), changes);
       port.postMessage({ bytes }, [bytes.buffer]);
     } catch (error) {
       port.postMessage({ error: reportOf(error, true) });
@@ -171,15 +183,13 @@ class Job {
    */
   sink(post) {
     return {
-      header: (opened) => {
-        post({ type: 'header', opened });
-        if (!this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
-      },
+      header: (opened) => post({ type: 'header', opened }),
       geometry: (tile, texels, { slot }, samples) => {
         const transfer = [texels.first.buffer, samples.points.buffer, samples.weights.buffer];
         if (texels.more) transfer.push(texels.more.buffer);
         post({ type: 'geometry', tile, slot, texels, samples }, transfer);
         this.sortSoon(SORT_INTERVAL_MS);
+        return this.room();
       },
       evict: (tile) => {
         if (this.drawn.some(({ index }) => index === tile)) this.sort(); // its slots are given to another
@@ -192,6 +202,7 @@ class Job {
           { type: 'band', tile, layer, band },
           arrays.map(({ buffer }) => buffer),
         );
+        return this.room();
       },
       progress: ({ decodeMs, ...progress }) => post({ type: 'progress', progress, decodeMs }),
       warn: (error) => post({ type: 'error', error: reportOf(error, false) }),
@@ -201,30 +212,6 @@ class Job {
         this.isDone = true;
       },
     };
-  }
-
-  /**
-   * Choose the tiles to draw, of those that are here.
-   *
-   * @param {TexelStream} stream
-   */
-  choose({ here, tiles: { nodes, looks, aims, hasLevels } }) {
-    const { tiles, isWhole, refined } = chooseTiles(
-      nodes,
-      (tile) => here.has(tile),
-      looks,
-      hasLevels ? aims.budget : Infinity,
-      this.refined,
-    );
-    const before = this.drawn;
-    this.drawn = tiles.flatMap((tile) => here.get(tile) ?? []);
-    this.isWhole = isWhole;
-    this.refined = refined;
-    this.splatCount = this.drawn.reduce((sum, { count }) => sum + count, 0);
-    const isNew = this.drawn.length !== before.length || this.drawn.some((tile, i) => tile !== before[i]);
-    if (isNew && !this.sorts) {
-      this.scope.postMessage({ type: 'cut', scene: this.scene, tiles: Uint32Array.from(tiles) });
-    }
   }
 
   /**
@@ -243,13 +230,20 @@ class Job {
   }
 
   sort() {
-    const { stream, camera } = this;
-    if (camera === null || stream === null) return;
+    const { scene, stream, shown, camera, visible } = this;
+    if (camera === null || stream === null || shown === null) return;
     const { id, view } = camera;
-    if (stream.tiles.view !== view) stream.tiles.setView(view);
-    this.choose(stream);
-    const { scene, splatCount, visible, isWhole } = this;
-    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete: stream.tiles.isComplete, isWhole });
+    const { here, tiles } = stream;
+    const { shares: before } = shown;
+    if (tiles.view !== view) tiles.setView(view);
+    shown.update((tile) => here.has(tile), performance.now());
+    const { isFading, isWhole, splatCount } = shown;
+    const shares = shown.shares === before ? null : shown.shares;
+    if (shares) this.drawn = Array.from(shares.keys(), (tile) => /** @type {CullTile} */ (here.get(tile)));
+    const isComplete = tiles.isComplete && !isFading;
+    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete, isWhole, shares });
+    this.sortedAt = performance.now();
+    if (isFading) this.sortSoon(STEP_MS);
     if (!this.sorts) {
       this.scope.postMessage({ ...reply, order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 });
       return;

@@ -24,7 +24,7 @@ __all__ = ["Backend", "Camera", "Mode", "render"]
 @overload
 def render(
     model: HasSplats | PackedFile,
-    camera: Camera,
+    camera: Camera | None = ...,
     *,
     background: ArrayLike = ...,
     mode: Mode = ...,
@@ -38,7 +38,7 @@ def render(
 @overload
 def render(
     model: HasSplats | PackedFile,
-    camera: Camera,
+    camera: Camera | None = ...,
     *,
     background: ArrayLike = ...,
     mode: Mode = ...,
@@ -51,7 +51,7 @@ def render(
 
 def render(
     model: HasSplats | PackedFile,
-    camera: Camera,
+    camera: Camera | None = None,
     *,
     background: ArrayLike = (0.0, 0.0, 0.0),
     mode: Mode = "standard",
@@ -69,7 +69,7 @@ def render(
     Args:
         model: a `SplatModel`, an object with its six arrays, or a file opened by `csplat.open`. Cameras, like `means`,
             are relative to its origin.
-        camera: the camera to render from.
+        camera: the camera to render from; `None`: the first view of a `SplatModel` (`csplat_render.first_view`).
         background: red, green, blue of the background.
         mode: `standard`; `fast`, which omits faint contributions; or `exact`, the slow reference in float64. A GPU has
             `standard` alone.
@@ -91,11 +91,16 @@ def render(
         (48, 64, 3)
 
     Raises:
-        InputError: array shapes do not match, an option is invalid, a package is not installed, or there is no GPU.
+        InputError: array shapes do not match, there is neither a camera nor a first view, an option is invalid, a
+            package is not installed, or there is no GPU.
         LimitError: too many large splats: more than `rasteriser.MAX_INTERSECTIONS`; or the scene exceeds the GPU's
             buffers.
     """
     # The renderers are imported lazily, because code that uses only cameras does not need them.
+    if camera is None:
+        from csplat_render.first_view import first_view
+
+        camera = first_view(model)
     device = _find_device(backend)
     if device is not None:
         from csplat_render.gpu.renderer import GpuScene

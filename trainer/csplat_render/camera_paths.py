@@ -3,8 +3,8 @@
 
 An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), at a distance that shows all of
 it. In *surroundings*, a circle would lead through walls. If cameras are known, the path follows their positions and
-directions. If the scene specifies an initial view, the path sways around it. Otherwise the path goes back and forth
-along the arc with the greatest surplus of visible detail.
+directions. If the scene specifies an initial view that is no estimate, the path sways around it. Otherwise the path
+goes back and forth along the arc with the greatest surplus of visible detail.
 
 These cameras are not used for scoring; `psnr` uses `virtual_cameras.virtual_cameras`.
 """
@@ -12,13 +12,13 @@ These cameras are not used for scoring; `psnr` uses `virtual_cameras.virtual_cam
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_metadata import VIEW
+from csplat.scene_metadata import ESTIMATE, VIEW
 from csplat.types import F64, Mask
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
 from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
@@ -89,8 +89,8 @@ def orbit_cameras(
         return orbit(frame.centre, 1.0, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     rng = np.random.default_rng(0)
     if frame.kind == "object":
-        body = _main_parts(sample_cloud(model, _POINTS, rng), frame)
-        centre, distance = _framing(body, frame, elevation, K, width, height)
+        body = main_parts(sample_cloud(model, _POINTS, rng), frame)
+        centre, distance = orbit_framing(body, frame, elevation, K, width, height)
         return orbit(centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     cloud = sample_cloud(model, _ARC_POINTS, rng)
     first = _first_view(model)
@@ -100,7 +100,7 @@ def orbit_cameras(
     return [frame.camera_at(float(angle), elevation, distance, K, width, height) for angle in angles]
 
 
-def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
+def main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
     """Return the points of the larger parts of an object, [M, 3], without floaters.
 
     Parts are connected sets of grid cells with two points or more. If the splats are too scattered, all points are
@@ -138,7 +138,7 @@ def _connected_cells(first: int, filled: Mask) -> Mask:
         connected = wider
 
 
-def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
+def orbit_framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
     """Find the shortest distance at which all images of an orbit show an object, among look-at points on its axis.
 
     Args:
@@ -177,9 +177,12 @@ def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int,
 
 
 def _first_view(model: SplatModel) -> Camera | None:
-    """Return the camera of a scene's initial view; `None` if it is absent or invalid."""
+    """Return the camera of a scene's initial view; `None` if it is absent, an estimate or invalid."""
+    view = model.metadata.entries.get(VIEW)
+    if not isinstance(view, Mapping) or view.get("from") == ESTIMATE:
+        return None
     try:
-        return Camera.from_json(model.metadata.entries[VIEW]) if VIEW in model.metadata.entries else None
+        return Camera.from_json(view)
     except InputError:
         return None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate the up axis of a scene that does not specify it, for viewing only; estimates are not written to files.
+"""Estimate the up axis of a scene that does not specify it, for viewing; files mark it as an estimate (`estimated`).
 
 Objects are usually photographed from all around and from above, seldom from below. So they show fine splats from above,
 and large, smeared splats or the ground from below. The sum of all viewing directions, weighted by the detail visible

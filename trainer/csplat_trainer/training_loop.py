@@ -6,7 +6,8 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,11 @@ import csplat
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_metadata import TRAINING, VIEW
+from csplat.scene_metadata import TRAINING
 from csplat.types import F32, I64
-from csplat_render.camera import Camera, central_camera
+from csplat_render.first_view import viewing_metadata
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import Lpips, load_lpips
-from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.device_measurements import make_rasteriser
 from csplat_trainer.engine import CpuEngine, Engine
@@ -46,6 +46,8 @@ _STEPS_BETWEEN = 100  # steps after each late pruning, or 1 % of the iterations
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
 _EXPONENT_MAX = 700.0  # largest exponent whose exponential fits float64
 _DOUBLING = 2.0  # growth of a resumed scene with too few splats, until it has enough
+_TIMED_IMAGES = 4  # images of timed steps
+_TIMED_STEPS, _TIMED_SECONDS = (3, 50), 1.0  # least and largest number of timed steps, and their least time otherwise
 _FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
 
@@ -65,7 +67,7 @@ def train(
     Args:
         data: a data set, or its path for `load`: a folder, or a `transforms.json`.
         options: options of the training.
-        outputs: checkpoints and previews.
+        outputs: checkpoints and a preview.
         on_step: called with the progress of the run, every `log_every` steps.
         context: threads and progress.
 
@@ -89,6 +91,32 @@ def train(
     images = data if isinstance(data, DataSet) else load(data)
     with thread_count(context.threads):
         return _Training(images, options or TrainOptions(), outputs or Outputs(), show, context).run()
+
+
+def time_step(data: DataSet, options: TrainOptions, splat_count: int, *, context: Context = DEFAULT_CONTEXT) -> float:
+    """Return the time of a training step of initial splats at the full SH degree, seconds: the mean of a few.
+
+    Args:
+        data: the data set, of which only a few images are read.
+        options: options of the training.
+        splat_count: number of splats.
+        context: threads.
+
+    Raises:
+        InputError: as for `train`.
+    """
+    images = data.inliers
+    few = replace(data, train=images[:: -(-len(images) // _TIMED_IMAGES)], test=[], val=[])
+    options = replace(options, max_splats=splat_count, initial_splats=splat_count)
+    with thread_count(context.threads):
+        training = _Training(few, options, Outputs(), lambda _: None, context)
+        training.time_step(0)  # allocates
+        begin, seconds, count = time.perf_counter(), 0.0, 0
+        while count < _TIMED_STEPS[0] or (count < _TIMED_STEPS[1] and seconds < _TIMED_SECONDS):
+            count += 1
+            training.time_step(count % len(few.train))
+            seconds = time.perf_counter() - begin
+    return seconds / count
 
 
 class _Training:
@@ -119,6 +147,7 @@ class _Training:
         self._log = self._fitter.log
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
+        self._next_preview = 0.0  # seconds of the run
         arrays: Mapping[str, NDArray[Any]] = {}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._place_splats(self._scene))
@@ -144,6 +173,11 @@ class _Training:
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
+    def time_step(self, view: int) -> None:
+        """Make a step on an image at the full SH degree, and wait for its end."""
+        self._fitter.iteration = self._options.iterations
+        self.step(view).read()
+
     def step(self, view: int) -> PendingLoss:
         fitter = self._fitter
         background = self._background
@@ -163,8 +197,9 @@ class _Training:
             self._report()
         if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
             self._evaluate(options.eval_views)
-        if outputs.preview_due(fitter.iteration, fitter.iterations):
-            self._preview()
+        if outputs.preview is not None and (fitter.is_last or fitter.seconds >= self._next_preview):
+            self._write_preview(outputs.preview)
+            self._next_preview = fitter.seconds + outputs.preview_seconds
 
     @property
     def _degree(self) -> int:
@@ -301,35 +336,30 @@ class _Training:
         self._log["evaluations"].append({"iteration": self._fitter.iteration, **metrics})
         return metrics
 
-    def _preview(self) -> None:
+    def _write_preview(self, path: str | Path) -> None:
         """Write the first test image, or training image if there are none, next to its render."""
-        assert self._outputs.previews is not None
-        folder = Path(self._outputs.previews)
-        folder.mkdir(parents=True, exist_ok=True)
         image = (self._data.test or self._data.train)[0]
         size = (image.camera.H, image.camera.W, 3)
         target = compose(image, self._background, np.empty(size, np.float32))
-        rendered = self._engine.render(image.camera, self._background, self._degree)
-        save_image(folder / f"{self._fitter.iteration:06d}.png", side_by_side(target, rendered))
+        save_image(path, side_by_side(target, self._engine.render(image.camera, self._background, self._degree)))
 
     def _save(self, path: str | Path) -> None:
         """Write a checkpoint."""
         screen = self._engine.screen
         self._fitter.save(
             path, "train", asdict(self._options), self._engine.parameters.on_cpu(),
-            own={"origin": self._data.origin}, arrays={} if screen is None else screen.state(),
+            own={"origin": self._data.origin, "size": self._data.size}, arrays={} if screen is None else screen.state(),
         )  # fmt: skip
 
     def _model(self) -> SplatModel:
-        """Return the scene, with the training's record, up direction and origin, and a first view of surroundings."""
+        """Return the scene, with the training's record, up direction, first view and origin."""
         model = to_model(self._engine.parameters.on_cpu().values, antialiased=self._options.antialiased)
         entries = {TRAINING: self._data.trained_on(self._colour).as_json()}
-        if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
-            entries[VIEW] = _first_view([image.camera for image in self._data.train])
         metadata = replace(model.metadata, entries=entries).with_up(
             self._data.up, self._data.coordinate_system, estimated=self._data.up_is_estimated
         )
-        return replace(model, metadata=metadata, origin=self._data.origin)
+        model = replace(model, metadata=metadata, origin=self._data.origin)
+        return model.with_metadata(viewing_metadata(model, [image.camera for image in self._data.train]))
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
         """Return the log of the steps with facts on the run; gains and biases of images if they were trained."""
@@ -396,16 +426,6 @@ def _expected_shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
     sh = values["shN"].shape[1:] if "shN" in values else ()
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "logits": (), "sh0": (3,), "shN": (*sh[:1], 3)}
     return {name: (len(values.get("logits", ())), *row) for name, row in rows.items()}
-
-
-def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Return the central camera as the entry `view` (spec 5.4), to seven digits."""
-    camera = central_camera(cameras)
-    matrices = {
-        name: [[float(f"{value:.7g}") for value in row] for row in matrix.tolist()]
-        for name, matrix in (("K", camera.K), ("viewmat", camera.viewmat))
-    }
-    return {**matrices, "W": camera.W, "H": camera.H, "near": float(f"{camera.near:.7g}"), "from": "training"}
 
 
 def _load_lpips_weights(options: TrainOptions, outputs: Outputs) -> Lpips | None:

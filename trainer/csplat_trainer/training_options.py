@@ -75,9 +75,9 @@ class TrainOptions:
         scale_weight: weight of the mean standard deviation in the loss (mcmc and fixed).
         noise: noise of the positions, as a multiple of their learning rate (mcmc and fixed).
         dead_opacity: splats below this opacity are moved (mcmc, fixed) or removed (gradient).
-        refine_start: first step after which the strategy may act.
+        refine_start: first step after which the strategy may act; 0: 500, at most an eighth of the iterations.
         refine_stop: fraction of the iterations after which the strategy ends.
-        refine_every: steps between its actions.
+        refine_every: steps between its actions; 0: 100, at most a fortieth of the iterations.
         growth: growth factor of mcmc per action; 0: 1.05, or a larger factor that reaches the cap halfway to
             `refine_stop`.
         grad_threshold: `gradient` densifies splats whose mean gradient on screen, in pixels of half an image, is above
@@ -119,9 +119,9 @@ class TrainOptions:
     scale_weight: float = 0.01
     noise: float = 2.5e5
     dead_opacity: float = 0.005
-    refine_start: int = 500
+    refine_start: int = 0
     refine_stop: float = 0.8
-    refine_every: int = 100
+    refine_every: int = 0
     growth: float = 0.0
     grad_threshold: float = 2e-4
     eval_every: int = 0
@@ -148,6 +148,16 @@ class TrainOptions:
         return self.sh_interval or min(1000, max(1, self.iterations // 15))
 
     @property
+    def refine_begin(self) -> int:
+        """First step after which the strategy may act."""
+        return self.refine_start or max(1, min(500, self.iterations // 8))
+
+    @property
+    def refine_period(self) -> int:
+        """Steps between the actions of the strategy."""
+        return self.refine_every or min(100, max(_LEAST_PERIOD, self.iterations // 40))
+
+    @property
     def refine_end(self) -> int:
         """Last step after which the strategy may act."""
         return int(self.refine_stop * self.iterations)
@@ -162,8 +172,8 @@ class TrainOptions:
 
     def refines_after(self, iteration: int) -> bool:
         """Return True if the strategy acts after a step."""
-        due = iteration % self.refine_every == 0
-        return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
+        due = iteration % self.refine_period == 0
+        return self.strategy != "none" and due and self.refine_begin <= iteration <= self.refine_end
 
     def prunings_left(self, iteration: int) -> int:
         """Return the number of prunings left, including the one after this step; 0 if there is none after this step.
@@ -182,7 +192,7 @@ class TrainOptions:
         """Return the growth factor per action of a run that starts with `count` splats."""
         if self.growth:
             return self.growth
-        times = (self.refine_end // 2 - self.refine_start) // self.refine_every + 1
+        times = self.refine_end // 2 // self.refine_period - (self.refine_begin - 1) // self.refine_period
         return max(_GROWTH, math.pow(self.max_splats / max(1, count), 1.0 / max(1, times)))
 
     def learning_rates(self, iteration: int, extent: float) -> dict[str, float]:
@@ -221,6 +231,7 @@ def uses_torch(device: Device, engine: EngineName) -> bool:
     return device != "cpu" or engine == "torch"
 
 
+_LEAST_PERIOD = 10  # steps between actions of the strategy in short trainings: Adam settles new splats in about as many
 _GROWTH = 1.05  # growth factor of the MCMC paper
 _MAX_PRUNINGS = 10  # largest number of prunings
 _PRUNING_FRACTION = 0.6  # fraction of the steps after the end of the strategy over which prunings are spread
@@ -260,7 +271,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "dead_opacity": (0, 0.5),
     "refine_start": (0, 10**7),
     "refine_stop": (0, 1),
-    "refine_every": (1, 10**7),
+    "refine_every": (0, 10**7),
     "growth": (0, 10),
     "grad_threshold": (0, 1),
     "eval_every": (0, 10**7),
@@ -277,28 +288,18 @@ class Outputs:
         checkpoint: file for checkpoints (each replaces the last), which SIGINT and SIGTERM write, too; or `None`.
         checkpoint_seconds: time between checkpoints, longer if writing one takes more than a twentieth of it; 0: a
             checkpoint after each step.
-        previews: folder for previews (image and render side by side), or `None`.
-        preview_every: steps between previews; 0: after 100, 200, 400, … steps and at the end.
+        preview: a PNG of an image next to its render, which is renewed during a training; or `None`.
+        preview_seconds: time between its renewals.
         resume: checkpoint to continue from, or `None`.
         lpips_weights: file of the weights of LPIPS-Alex; `None`: see `csplat_render.lpips`.
     """
 
     checkpoint: str | Path | None = None
     checkpoint_seconds: float = 60.0
-    previews: str | Path | None = None
-    preview_every: int = 0
+    preview: str | Path | None = None
+    preview_seconds: float = 10.0
     resume: str | Path | None = None
     lpips_weights: str | Path | None = None
-
-    def preview_due(self, iteration: int, iterations: int) -> bool:
-        """Return True if a preview is due after a step."""
-        if self.previews is None:
-            return False
-        if iteration == iterations:
-            return True
-        if self.preview_every:
-            return iteration % self.preview_every == 0
-        return iteration % 100 == 0 and (iteration // 100).bit_count() == 1
 
 
 def save_to(outputs: Outputs, save: Callable[[str | Path], None]) -> Callable[[], None] | None:

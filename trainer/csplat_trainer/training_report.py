@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports of a training run: loss plot, previews, memory."""
+"""Reports of a training run: loss plot, preview, memory."""
 
 from __future__ import annotations
 

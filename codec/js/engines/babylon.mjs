@@ -10,9 +10,10 @@ import { Matrix, Quaternion, Vector3 } from '@babylonjs/core/Maths/math.vector.j
 import { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js';
 import { Observable } from '@babylonjs/core/Misc/observable.js';
 
+import { FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { SplatPool } from '../levels/splat_pool.mjs';
 import { openScene } from './scene.mjs';
-import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
+import { displayColour, eachThinnest, places, putAlphas, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 const NAME = 'csplat';
 const ROW_BYTES = 32; // per splat: centre and scales as float32; colour, alpha and rotation as bytes
@@ -23,7 +24,7 @@ const SH_ZERO = 128;
  * @typedef {import('@babylonjs/core/scene.js').Scene} Scene
  * @typedef {import('./babylon.d.ts').CSPLATLoadingOptions} CSPLATLoadingOptions
  * @typedef {import('./scene.mjs').SplatScene} SplatScene
- * @typedef {import('../levels/level_scene.mjs').LoadedTile} LoadedTile
+ * @typedef {import('../levels/splat_pool.mjs').SplatArrays} SplatArrays
  */
 
 /** The plugin. */
@@ -119,9 +120,9 @@ async function meshOf(scene, opened, keepInRam = false) {
   const width = scene.getEngine().getCaps().maxTextureSize;
   const degree = opened.progressive ? 0 : opened.degree;
   const bands = new Bands(header.splatCount, degree, width);
-  const { rows, put } = rowsOf(opened, bands);
+  const { rows, put, fade } = rowsOf(opened, bands);
   const drawing = opened.levels ? new Drawing(scene, opened, rows, bands, width) : null;
-  if (drawing) await opened.drawLevels(drawing.poolOf(put));
+  if (drawing) await opened.drawLevels(drawing.poolOf({ put, fade }));
   for await (const tile of opened.tiles()) put(tile, tile.first);
   if (scene.isDisposed) {
     opened.release();
@@ -159,18 +160,20 @@ function rowsOf({ header }, bands) {
   const numbers = places(floats, ROW_BYTES / 4, 0, 6);
   const bytes = places(new Uint8ClampedArray(rows), ROW_BYTES, 24, 8);
   const [centreAt, scalesAt] = [numbers.slice(0, 3), numbers.slice(3)];
-  const [colourAt, alphaAt, quatAt] = [bytes.slice(0, 3), bytes.slice(3, 4), bytes.slice(4)];
-  const alpha = alphaOf(header);
-  const put = (/** @type {LoadedTile} */ tile, /** @type {number} */ first) => {
+  const [colourAt, alphaAt, quatAt] = [bytes.slice(0, 3), bytes[3], bytes.slice(4)];
+  /** @type {SplatArrays['fade']} */
+  const fade = (tile, first, shares) => putAlphas(tile, header, alphaAt, first, (alpha) => 255 * alpha, shares);
+  /** @type {SplatArrays['put']} */
+  const put = (tile, first) => {
     putColumns(tile.means, centreAt, first, (value) => value);
     putColumns(tile.scales, scalesAt, first, Math.exp);
     if (header.flat) eachThinnest(tile, (i, c) => (floats[(ROW_BYTES / 4) * (first + i) + 3 + c] = 0));
     putBand(tile.sh0, colourAt, first, (value) => 255 * displayColour(value));
-    putColumns(tile.opacities, alphaAt, first, (q) => 255 * alpha(q));
+    fade(tile, first, FADE_STEPS);
     putQuats(tile.quats, header, quatAt, first, signed);
     for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
   };
-  return { rows, put };
+  return { rows, put, fade };
 }
 
 /** Draws a pool of splats, by the functions with which the engine streams SOG. */
@@ -194,16 +197,20 @@ class Drawing {
     this.mesh = null;
     /** @type {[number, number][]} */
     this.changed = [];
+    /** @type {[number, number][]} */
+    this.faded = [];
   }
 
-  /** @param {(tile: LoadedTile, first: number) => void} put */
-  poolOf(put) {
+  /** @param {Pick<SplatArrays, 'put' | 'fade'>} rows */
+  poolOf({ put, fade }) {
     this.pool = new SplatPool(this.opened.header.splatCount, {
       put,
+      fade,
       putBand: (layer, band, first) => this.bands.put(layer, band, first),
       clear: (first, count) => this.bands.clear(first, count), // the rest is not in the ranges that are drawn
-      flush: (changed) => {
+      flush: (changed, faded) => {
         this.changed.push(...changed);
+        this.faded.push(...faded);
         this.upload();
       },
     });
@@ -236,8 +243,9 @@ class Drawing {
   }
 
   upload() {
-    const { bands, changed, mesh, pool, rows, width } = this;
+    const { bands, changed, faded, mesh, pool, rows, width } = this;
     if (mesh === null || pool === null) return;
+    for (const [first, count] of faded) this.#uploadColours(mesh, first, count);
     for (const [first, count] of changed) {
       mesh._writeStreamingSplats(first, count, new Uint8Array(rows, ROW_BYTES * first, ROW_BYTES * count));
       const line = Math.floor(first / width);
@@ -246,9 +254,30 @@ class Drawing {
         mesh._updateShTextureData(mesh._shTextures[i], texels, width, line, lines);
       }
     }
-    this.changed = [];
+    this.changed = this.faded = [];
     const drawn = Array.from(pool.places.values(), ({ first: offset, tile: { count } }) => ({ offset, count }));
     mesh.setSplatIndexRanges(drawn);
+  }
+
+  /**
+   * Upload the colours of splats whose opacities have changed.
+   *
+   * @param {GaussianSplattingMesh} mesh
+   * @param {number} first
+   * @param {number} count
+   */
+  #uploadColours(mesh, first, count) {
+    const words = new Uint32Array(this.rows);
+    const colours = new Uint32Array(count);
+    for (let i = 0; i < count; i++) colours[i] = words[(ROW_BYTES / 4) * (first + i) + 6];
+    const { x: width } = mesh._getTextureSize(mesh._vertexCount);
+    for (let at = 0; at < count;) {
+      const [column, row] = [(first + at) % width, Math.floor((first + at) / width)];
+      const run = Math.min(count - at, width - column);
+      const bytes = new Uint8Array(colours.buffer, 4 * at, 4 * run);
+      mesh._updateTextureFromDataRect(mesh._colorsTexture, bytes, column, row, run, 1);
+      at += run;
+    }
   }
 }
 

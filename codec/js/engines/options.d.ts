@@ -29,6 +29,21 @@ export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
 /** The source of a scene. */
 export type SceneSource = string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource;
 
+/** The first view of a scene, for the engine's camera, in the coordinates of the upright scene. */
+export interface SceneView {
+  position: number[];
+  /** A point on the line of sight, as far away as the middle of the scene: what an orbit turns around. */
+  target: number[];
+  /** Towards the top of the picture, of length 1. */
+  up: number[];
+  /** Distance of the near plane. */
+  near: number;
+  /** `training` (a camera of the training), `author` (a person), `estimate` (a program), or '' if the file does not tell. */
+  from: string;
+  /** Return the vertical field of view, in degrees, with which a canvas of this shape, width / height, shows all of the view. */
+  fov(aspect: number): number;
+}
+
 /** The property `csplat` of an engine's object. */
 export interface SceneFacts<T = void> {
   /** `axes`, `antialiased`, `origin` (the position that coordinates are relative to), `unitMetres`, `shDegree`, …, of the file. */
@@ -36,7 +51,9 @@ export interface SceneFacts<T = void> {
   /** Number of splats of the loaded version. */
   splatCount: number;
   metadata: Record<string, unknown> | null;
-  /** A sphere around most splats of the upright scene, for an initial camera. */
+  /** Where a viewer starts: as the file has it, the same in every viewer; else an estimate from the boxes of its tiles. */
+  view: SceneView;
+  /** A sphere around most splats of the upright scene. */
   bounds: { center: number[]; radius: number };
   /**
    * Resolves when the SH bands are loaded: at once, unless the load was progressive; with `levels`, when all that a camera

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Converts packed tiles to numbers of any type and layout, for the adapters of engines.
 
+import { FADE_STEPS, fadedAlpha } from '../levels/shown_tiles.mjs';
+
 /**
  * @typedef {import('../decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('../decoder.d.ts').Header} Header
@@ -18,10 +20,20 @@ const ROWS_AT_ONCE = 1024;
 /** Display colour, 0 to 1 within the displayable range. @param {number} sh0 */
 export const displayColour = (sh0) => 0.5 + SH_C0 * sh0;
 
-/** Return the conversion from the integers of `opacities` to alpha. @param {Header} header @returns {Change} */
-export function alphaOf({ attributes }) {
+/**
+ * Write opacities to an engine's arrays.
+ *
+ * @param {Pick<PackedTile, 'opacities'>} tile
+ * @param {Header} header
+ * @param {Place} to
+ * @param {number} first splat
+ * @param {Change} change receives alpha
+ * @param {number} [shares] that are drawn of splats that fade
+ */
+export function putAlphas({ opacities }, { attributes }, to, first, change, shares = FADE_STEPS) {
   const { levels, mapping } = /** @type {AttributeRecord} */ (attributes.find(({ name }) => name === 'opacities'));
-  return mapping === 'square' ? (q) => (q * q) / (levels * levels) : (q) => q / levels;
+  const alpha = (/** @type {number} */ q) => (mapping === 'square' ? (q * q) / (levels * levels) : q / levels);
+  putColumns(opacities, [to], first, (q) => change(fadedAlpha(alpha(q), shares)));
 }
 
 /**

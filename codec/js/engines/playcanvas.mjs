@@ -4,6 +4,7 @@
 
 import * as pc from 'playcanvas';
 
+import { FADE_EXCESS, FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
 import { openScene } from './scene.mjs';
@@ -29,7 +30,7 @@ const GLSL = /* glsl */ `
 uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whether alpha is squared
 uniform vec4 csOther; // lowest integer and step of colours, lowest integer and unit of quats
 uniform vec4 csLows;  // lowest integers of SH bands; whether splats are discs
-uniform vec4 csSteps;
+uniform vec4 csSteps; // of these; share that is not drawn, see fadedAlpha
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 vec3 getCenter() {
   uvec4 mean = loadCsMeans();
@@ -54,6 +55,7 @@ vec3 getScale() {
 vec4 getColor() {
   float alpha = float(loadCsShapes().w) / csShape.z;
   if (csShape.w > 0.5) alpha *= alpha;
+  alpha *= (1.0 - csSteps.w) * (1.0 + ${FADE_EXCESS} * alpha * csSteps.w);
   return vec4(0.5 + 0.28209479177387814 * (vec3(loadCsColours().xyz) + csOther.x) * csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -105,6 +107,7 @@ fn getScale() -> vec3f {
 fn getColor() -> vec4f {
   var alpha = f32(loadCsShapes().w) / uniform.csShape.z;
   if (uniform.csShape.w > 0.5) { alpha *= alpha; }
+  alpha *= (1.0 - uniform.csSteps.w) * (1.0 + ${FADE_EXCESS} * alpha * uniform.csSteps.w);
   return vec4f(0.5 + 0.28209479177387814 * (vec3f(loadCsColours().xyz) + uniform.csOther.x) * uniform.csOther.y, alpha);
 }
 #if SH_BANDS > 0
@@ -148,6 +151,8 @@ class CsplatResource extends pc.GSplatResourceBase {
     this.entities = new Set();
     /** @type {import('./options.d.ts').SceneFacts | null} */
     this.csplat = null;
+    /** Parameters of the shaders, of which the last fades. @type {number[]} */
+    this.steps = [0, 0, 0, 0];
     /** What draws levels of detail. @type {TileEntities | null} */
     this.tiles = null;
     this.streams.textureDimensions.set(images.csMeans.width, images.csMeans.height);
@@ -168,7 +173,15 @@ class CsplatResource extends pc.GSplatResourceBase {
     }
     this.gsplatData.shBands = degree;
     this._format = new pc.GSplatFormat(device, this.described, { readGLSL: GLSL, readWGSL: WGSL });
+    const hidden = this.steps[3];
     for (const [name, value] of Object.entries(parameters)) this.parameters.set(name, value);
+    this.steps = /** @type {number[]} */ (this.parameters.get('csSteps'));
+    this.steps[3] = hidden;
+  }
+
+  /** @param {number} shares that are drawn */
+  fade(shares) {
+    this.steps[3] = 1 - shares / FADE_STEPS; // the engine's materials refer to this array
   }
 
   /** Add the SH bands of a progressive load. */
@@ -253,8 +266,9 @@ class TileEntities {
   /**
    * @param {number} index
    * @param {LoadedTile} tile
+   * @param {number} shares
    */
-  show(index, tile) {
+  show(index, tile, shares) {
     const { scene, app, options } = this;
     const record = { ...allTiles(scene.file)[index], index: 0, first: 0 };
     const header = { ...scene.file, tiles: [record], splatCount: tile.count };
@@ -267,7 +281,19 @@ class TileEntities {
       options,
     );
     this.shown.set(index, { tile, resource, children: new Map() });
+    this.fade(index, shares);
     this.band(index);
+  }
+
+  /**
+   * @param {number} index
+   * @param {number} shares
+   */
+  fade(index, shares) {
+    const one = this.shown.get(index);
+    one?.resource.fade(shares);
+    for (const { gsplat } of one?.children.values() ?? [])
+      if (gsplat) gsplat.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
   }
 
   /** @param {number} index a tile to which a band was added: they are drawn when all of them are here */

@@ -4,6 +4,7 @@
 import { CsplatReader } from '../decoder.mjs';
 import { LevelScene } from '../levels/level_scene.mjs';
 import { poolSize } from '../levels/splat_pool.mjs';
+import { ballOf, eyeOf, firstView } from '../first_view.mjs';
 import { drawnOtherwise } from '../registry.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
@@ -66,7 +67,7 @@ export async function openScene(from, options, target, signals = []) {
       const aims = { budget: maxSplats, pixels: pixelError, around: true };
       streamed = await LevelScene.open(/** @type {any} */ (reader), aims, signal, { shDegree: degree, workers });
     }
-    const { metadata } = await described; // it comes together with the coarsest version
+    const description = await described; // it comes together with the coarsest version
     const version = streamed ? [] : await chooseTiles(reader, maxSplats);
     if (degree < wanted)
       onceSaid(target.name, `SH bands above ${degree} are left out: the engine ends at degree ${degree}`);
@@ -75,7 +76,7 @@ export async function openScene(from, options, target, signals = []) {
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
     const settings = { degree, progressive: progressive === true && degree > 0 && !streamed, workers };
-    return new SplatScene(reader, version, metadata, settings, target, life, streamed);
+    return new SplatScene(reader, version, description, settings, target, life, streamed);
   } catch (error) {
     life.end();
     throw error;
@@ -127,13 +128,21 @@ export class SplatScene {
   /**
    * @param {CsplatReader} reader
    * @param {TileRecord[]} version its tiles
-   * @param {Record<string, unknown> | null} metadata
+   * @param {Pick<import('../decoder.d.ts').Description, 'metadata' | 'cameras'>} description
    * @param {{degree: number, progressive: boolean, workers: number}} wanted
    * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
    * @param {Life} life
    * @param {LevelScene | null} [levels]
    */
-  constructor(reader, version, metadata, { degree, progressive, workers }, { engine, mirrors }, life, levels = null) {
+  constructor(
+    reader,
+    version,
+    { metadata, cameras },
+    { degree, progressive, workers },
+    { engine, mirrors },
+    life,
+    levels = null,
+  ) {
     /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
     /** The header of the file. */
@@ -147,7 +156,7 @@ export class SplatScene {
       return { ...tile, index, first };
     });
     /** The header of a file with this version alone, or with room for what is streamed. */
-    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels) : splatCount };
+    this.header = { ...reader.header, tiles, splatCount: levels ? poolSize(levels.stream) : splatCount };
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;
@@ -164,6 +173,7 @@ export class SplatScene {
     this.mirrored = determinant < 0 && !mirrors;
     /** 3 × 3, by rows: makes the scene upright. */
     this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
+    this.view = uprightView(reader.header, { metadata, cameras }, [a, b, c]);
   }
 
   /**
@@ -321,7 +331,7 @@ export class SplatScene {
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
-    const { file: header, metadata, bounds, levels } = this;
+    const { file: header, metadata, view, bounds, levels } = this;
     const { splatCount } = this.header;
     this.isShown = true;
     const whole = levels ? Promise.race([levels.complete, levels.stream.failed]) : Promise.resolve();
@@ -330,7 +340,7 @@ export class SplatScene {
     complete
       .catch((error) => this.life.signal.aborted || console.error(error))
       .finally(() => levels === null && this.release());
-    return { header, splatCount, metadata, bounds, complete, levels };
+    return { header, splatCount, metadata, view, bounds, complete, levels };
   }
 
   /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */
@@ -360,6 +370,31 @@ export class SplatScene {
     );
     return reader;
   }
+}
+
+/**
+ * Return the first view of the upright scene.
+ *
+ * @param {Header} header
+ * @param {Pick<import('../decoder.d.ts').Description, 'metadata' | 'cameras'>} description
+ * @param {number[][]} upright 3 × 3, by rows
+ * @returns {import('./options.d.ts').SceneView}
+ */
+function uprightView(header, description, upright) {
+  const first = firstView(header, description, upright[1]);
+  const { viewmat: m, lens, near, from } = first;
+  const { eye, distance } = eyeOf(first, ballOf(header));
+  const turned = (/** @type {number[]} */ v) => upright.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
+  const fov = (/** @type {number} */ aspect) =>
+    (360 / Math.PI) * Math.atan(0.5 / (lens.fy * Math.min(aspect / lens.W, 1 / lens.H)));
+  return {
+    position: turned(eye),
+    target: turned(eye.map((value, k) => value + distance * m[8 + k])),
+    up: turned([-m[4], -m[5], -m[6]]),
+    near,
+    from,
+    fov,
+  };
 }
 
 /** @param {import('../decoder.d.ts').PackedGeometry} tile */

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Packs tiles into the words of Spark's splats. Independent of the engine, for testing.
 
-import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
+import { displayColour, eachThinnest, places, putAlphas, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Header} Header
@@ -59,12 +59,20 @@ export class ExtWords {
     const [a, b] = this.extArrays;
     const halves = new Uint16Array(b.buffer);
     putColumns(tile.means, places(new Float32Array(a.buffer), 4, 0), first, (mean) => mean);
-    const alpha = alphaOf(header);
-    putColumns(tile.opacities, places(a, 4, 3, 1), first, (q) => half(alpha(q)));
+    this.fade(tile, first);
     putColumns(tile.sh0, places(halves, 8, 0), first, (sh0) => half(displayColour(sh0)));
     putColumns(tile.scales, places(halves, 8, 3), first, half);
     if (header.flat) eachThinnest(tile, (i, c) => (halves[8 * (first + i) + 3 + c] = half(LN_SCALE_ZERO)));
     eachQuat(tile, header, (i, w, x, y, z) => (b[4 * (first + i) + 3] = octahedral(w, x, y, z, 10, 12)));
+  }
+
+  /**
+   * @param {Pick<PackedTile, 'opacities'>} tile
+   * @param {number} first splat
+   * @param {number} [shares]
+   */
+  fade(tile, first, shares) {
+    putAlphas(tile, this.header, { array: this.extArrays[0], stride: 4, start: 3 }, first, half, shares);
   }
 
   /**
@@ -134,14 +142,13 @@ export class PackedWords {
     const { header, packedArray } = this;
     const { rgbMin, rgbMax, lnScaleMin, lnScaleMax } = this.splatEncoding;
     const bytes = new Uint8ClampedArray(packedArray.buffer); // rounds when written
-    const alpha = alphaOf(header);
     putColumns(
       tile.sh0,
       places(bytes, 16, 0),
       first,
       (sh0) => (255 * (displayColour(sh0) - rgbMin)) / (rgbMax - rgbMin),
     );
-    putColumns(tile.opacities, places(bytes, 16, 3, 1), first, (q) => 255 * alpha(q));
+    putAlphas(tile, header, { array: bytes, stride: 16, start: 3 }, first, (alpha) => 255 * alpha);
     putColumns(tile.means, places(new Uint16Array(packedArray.buffer), 8, 2), first, half);
     const perScale = 254 / (lnScaleMax - lnScaleMin);
     putColumns(tile.scales, places(bytes, 16, 12), first, (scale) => Math.max(1, 1 + (scale - lnScaleMin) * perScale));

@@ -88,12 +88,16 @@ async function streamed(scene) {
   const mesh = new SplatMesh({ extSplats: splats });
   /** @type {[number, number][]} */
   let changed = [];
+  /** @type {[number, number][]} */
+  let faded = [];
   const pool = new SplatPool(scene.header.splatCount, {
     put: (tile, first) => words.put(tile, first),
+    fade: (tile, first, shares) => words.fade(tile, first, shares),
     putBand: (layer, sh, first, count) => words.putBand(layer, { sh, first, count }),
     clear: (first, count) => words.clear(first, count),
-    flush: (ranges, end) => {
+    flush: (ranges, opacities, end) => {
       changed.push(...ranges);
+      faded.push(...ranges, ...opacities);
       splats.numSplats = end;
       mesh.needsUpdate = true;
     },
@@ -104,8 +108,10 @@ async function streamed(scene) {
     const { camera, renderer, renderSize } = frame;
     const [first, second] = splats.textures;
     const sh = Object.values(splats.extra).flatMap((/** @type {any} */ one) => one.value ?? []);
-    for (const texture of changed.length ? [first, second, ...sh] : []) upload(renderer, texture, changed);
+    for (const texture of changed.length ? [second, ...sh] : []) upload(renderer, texture, changed);
+    upload(renderer, first, faded);
     changed = [];
+    faded = [];
     modelView.multiplyMatrices(camera.matrixWorldInverse, mesh.matrixWorld);
     const picture = { width: renderSize.x, height: renderSize.y, near: camera.near };
     scene.look(modelView.elements, camera.projectionMatrix.elements, picture);

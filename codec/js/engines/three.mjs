@@ -8,9 +8,10 @@
 
 import { Box3, BufferAttribute, BufferGeometry, Loader, Matrix4, Sphere, Vector2, Vector3 } from 'three';
 
+import { FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { SplatPool } from '../levels/splat_pool.mjs';
 import { openScene } from './scene.mjs';
-import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './packed_values.mjs';
+import { displayColour, onceSaid, places, putAlphas, putBand, putColumns, putCovariances } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').ByteSource} ByteSource
@@ -113,12 +114,14 @@ async function geometryOf(scene) {
   const bands = new Bands(count, scene.progressive ? 0 : scene.degree);
   const centreAt = places(centres, 3, 0);
   const [red, green, blue, alphaAt] = places(colours, 4, 0, 4);
-  const alpha = alphaOf(header);
-  const put = (/** @type {import('../levels/level_scene.mjs').LoadedTile} */ tile, /** @type {number} */ first) => {
+  /** @type {import('../levels/splat_pool.mjs').SplatArrays['fade']} */
+  const fade = (tile, first, shares) => putAlphas(tile, header, alphaAt, first, (alpha) => 255 * alpha, shares);
+  /** @type {import('../levels/splat_pool.mjs').SplatArrays['put']} */
+  const put = (tile, first) => {
     putColumns(tile.means, centreAt, first, (value) => value);
     putCovariances(tile, header, covariances, first);
     putBand(tile.sh0, [red, green, blue], first, (value) => 255 * displayColour(value));
-    putColumns(tile.opacities, [alphaAt], first, (q) => 255 * alpha(q));
+    fade(tile, first, FADE_STEPS);
   };
   const geometry = new BufferGeometry();
   geometry.setAttribute('position', new BufferAttribute(centres, 3));
@@ -134,7 +137,7 @@ async function geometryOf(scene) {
     };
     const putOne = bands.put.bind(bands);
     const flush = drawing.flush.bind(drawing);
-    await scene.drawLevels(new SplatPool(count, { put, putBand: putOne, clear, flush }));
+    await scene.drawLevels(new SplatPool(count, { put, fade, putBand: putOne, clear, flush }));
     geometry.boundingBox = new Box3(...scene.corners(Vector3));
     geometry.boundingSphere = geometry.boundingBox.getBoundingSphere(new Sphere());
   }
@@ -168,13 +171,19 @@ class Drawing {
     this.geometry = geometry;
     /** @type {[number, number][]} */
     this.changed = [];
+    /** @type {[number, number][]} */
+    this.faded = [];
     this.modelView = new Matrix4();
     this.size = new Vector2();
   }
 
-  /** @param {[number, number][]} ranges */
-  flush(ranges) {
+  /**
+   * @param {[number, number][]} ranges
+   * @param {[number, number][]} faded
+   */
+  flush(ranges, faded) {
     this.changed.push(...ranges);
+    this.faded.push(...faded);
   }
 
   /** @param {GaussianSplat} splats */
@@ -185,7 +194,7 @@ class Drawing {
       this.modelView.multiplyMatrices(camera.matrixWorldInverse, splats.matrixWorld);
       const { x: width, y: height } = renderer.getDrawingBufferSize(this.size);
       this.scene.look(this.modelView.elements, camera.projectionMatrix.elements, { width, height, near: camera.near });
-      if (this.changed.length > 0) this.copy(splats);
+      if (this.changed.length + this.faded.length > 0) this.copy(splats);
       own(renderer, scene, camera);
     };
   }
@@ -199,6 +208,9 @@ class Drawing {
     const [centre, a, b] = [buffers.centerRead, buffers.covarianceARead, buffers.covarianceBRead].map(
       ({ value }) => value.array,
     );
+    this.upload(buffers.colorRead.value, 1, colours, this.faded);
+    this.faded = [];
+    if (this.changed.length === 0) return;
     for (const [first, count] of this.changed) {
       for (let i = first; i < first + count; i++) {
         for (let k = 0; k < 3; k++) centre[4 * i + k] = centres[3 * i + k];
@@ -223,9 +235,10 @@ class Drawing {
    * @param {StorageAttribute} attribute
    * @param {number} width words per splat
    * @param {ArrayLike<number> | null} words copied to it, unless it has them already
+   * @param {[number, number][]} [ranges]
    */
-  upload(attribute, width, words) {
-    for (const [first, count] of this.changed) {
+  upload(attribute, width, words, ranges = this.changed) {
+    for (const [first, count] of ranges) {
       const [start, size] = [width * first, width * count];
       if (words && words !== attribute.array) {
         for (let i = start; i < start + size; i++) attribute.array[i] = words[i];

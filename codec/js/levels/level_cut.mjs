@@ -228,11 +228,14 @@ function refine(nodes, errors, budget, { must, may }) {
     count -= splatCount;
     for (const child of children) take(nodes[child]);
   };
+  /** @type {(node: TreeNode) => number} */
+  const splatsOf = (node) =>
+    must(node) ? node.children.reduce((sum, child) => sum + splatsOf(nodes[child]), 0) : node.splatCount;
   for (const node of nodes) if (node.parent === null) take(node);
   for (const node of [...nodes].sort((a, b) => errors[b.index] - errors[a.index] || b.index - a.index)) {
     const isInCut = !refined.has(node.index) && (node.parent === null || refined.has(node.parent));
     if (!isInCut || !may(node)) continue;
-    const added = node.children.reduce((sum, child) => sum + nodes[child].splatCount, -node.splatCount);
+    const added = node.children.reduce((sum, child) => sum + splatsOf(nodes[child]), -node.splatCount);
     if (count + added > budget) break;
     open(node);
   }

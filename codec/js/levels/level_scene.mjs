@@ -2,7 +2,7 @@
 // Draws the levels of detail of a file in an engine: streams what a camera requires, and tells the engine which tiles to show.
 
 import { LayerWorkers } from '../workers.mjs';
-import { chooseTiles } from './level_cut.mjs';
+import { STEP_MS, ShownTiles } from './shown_tiles.mjs';
 import { TileStream, nextTask } from './tile_stream.mjs';
 
 /**
@@ -22,7 +22,8 @@ import { TileStream, nextTask } from './tile_stream.mjs';
  *
  * @typedef {object} TileTarget
  * @property {(index: number) => void} hide
- * @property {(index: number, tile: LoadedTile) => void} show
+ * @property {(index: number, tile: LoadedTile, shares: number) => void} show a tile, of which shares are drawn
+ * @property {(index: number, shares: number) => void} fade changes these, see `fadedAlpha`
  * @property {(index: number, layer: number, band: Packed) => void} band adds a band to a tile that is shown
  * @property {() => void} flush
  *
@@ -61,12 +62,9 @@ export class LevelScene {
     this.turn = { geometry: (tile) => tile, band: (band) => band };
     /** Tiles in memory. @type {Map<number, LoadedTile>} */
     this.loaded = new Map();
-    /** Tiles that are drawn. @type {Set<number>} */
-    this.shown = new Set();
+    this.shown = new ShownTiles(stream);
     /** Bands of these that arrived since the last change. @type {[number, number, Packed][]} */
     this.bands = [];
-    /** @type {Set<number>} */
-    this.refined = new Set();
     /** @type {TileTarget | null} */
     this.target = null;
     /** @type {View | null} */
@@ -76,8 +74,6 @@ export class LevelScene {
     this.changedAt = -Infinity;
     this.isChanging = false;
     this.isDue = false; // something has arrived or moved since the last change
-    /** Number of splats that are drawn. */
-    this.splatCount = 0;
     /** @type {() => void} */
     this.showedAll = () => {};
     /** Resolves when the whole scene is drawn, at any level. */
@@ -99,7 +95,7 @@ export class LevelScene {
       band: ({ index }, layer, { sh }) => {
         const band = this.turn.band(sh, layer);
         /** @type {LoadedTile} */ (this.loaded.get(index)).sh[layer - 1] = band;
-        if (!this.shown.has(index)) return;
+        if (!this.shown.shares.has(index)) return;
         this.bands.push([index, layer, band]);
         this.#changeSoon();
       },
@@ -115,18 +111,18 @@ export class LevelScene {
 
   /** Whether all that the camera requires is drawn. */
   get isComplete() {
-    const { stream, view, isChanging, isDue } = this;
-    return view !== null && view === stream.view && stream.isComplete && !isChanging && !isDue;
+    const { stream, shown, view, isChanging, isDue } = this;
+    return view !== null && view === stream.view && stream.isComplete && !shown.isFading && !isChanging && !isDue;
+  }
+
+  /** Number of splats that are drawn. */
+  get splatCount() {
+    return this.shown.splatCount;
   }
 
   /** Bytes that the camera requires and that are not here. */
   get missingBytes() {
     return this.stream.amounts.missing;
-  }
-
-  /** Number of splats that are drawn at most, unless the coarsest version has more. */
-  get budget() {
-    return Math.max(this.stream.aims.budget, this.stream.rootSplats);
   }
 
   /**
@@ -176,7 +172,7 @@ export class LevelScene {
         this.timer = undefined;
         this.#change(/** @type {TileTarget} */ (this.target)).catch((error) => this.stream.fail(error));
       },
-      Math.max(0, this.changedAt + INTERVAL_MS - performance.now()),
+      Math.max(0, this.changedAt + (this.shown.isFading ? STEP_MS : INTERVAL_MS) - performance.now()),
     );
   }
 
@@ -187,23 +183,22 @@ export class LevelScene {
    */
   async #change(target) {
     const { stream, view, loaded, shown, bands } = this;
+    const { shares: before } = shown;
     this.isChanging = true;
     this.isDue = false;
     if (view !== null && view !== stream.view) stream.setView(view);
-    const { nodes, looks, aims } = stream;
-    const isHere = (/** @type {number} */ tile) => loaded.has(tile);
-    const { tiles, isWhole, refined } = chooseTiles(nodes, isHere, looks, aims.budget, this.refined, aims.pixels);
-    this.refined = refined;
-    this.shown = new Set(tiles);
+    shown.update((tile) => loaded.has(tile), performance.now(), stream.aims.pixels);
+    const { shares } = shown;
     this.bands = [];
-    const removed = [...shown].filter((index) => !this.shown.has(index));
+    const removed = [...before.keys()].filter((index) => !shares.has(index));
     for (const index of removed) target.hide(index);
     const tasks = bands
-      .filter(([index]) => this.shown.has(index) && shown.has(index))
+      .filter(([index]) => shares.has(index) && before.has(index))
       .map((band) => () => target.band(...band));
-    for (const index of tiles) {
+    for (const [index, some] of shares) {
       const tile = /** @type {LoadedTile} */ (loaded.get(index)); // it may be evicted before its turn
-      if (!shown.has(index)) tasks.push(() => target.show(index, tile));
+      if (!before.has(index)) tasks.push(() => target.show(index, tile, some));
+      else if (before.get(index) !== some) tasks.push(() => target.fade(index, some));
     }
     for (const task of tasks) {
       task();
@@ -211,11 +206,10 @@ export class LevelScene {
       if (this.target === null) return;
     }
     if (removed.length + tasks.length > 0) target.flush();
-    this.splatCount = tiles.reduce((sum, index) => sum + stream.all[index].splatCount, 0);
     this.changedAt = performance.now();
     this.isChanging = false;
-    if (isWhole) this.showedAll();
-    if (this.isDue) this.#changeSoon();
+    if (shown.isWhole) this.showedAll();
+    if (this.isDue || shown.isFading) this.#changeSoon();
     if (this.isComplete) this.completed();
   }
 }

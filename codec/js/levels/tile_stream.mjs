@@ -14,12 +14,13 @@ import { Ranges } from './ranges.mjs';
  * @typedef {import('../reader.mjs').Reader} Reader
  * @typedef {import('./level_cut.mjs').View} View
  *
- * Receives what was read. `decode` reads a layer as the decoder's form 'packed'; `geometry` and `band` take the result.
+ * Receives what was read. `decode` reads a layer as the decoder's form 'packed'; `geometry` and `band` take the result, and may
+ * return a promise to wait for before the next one is decoded.
  *
  * @typedef {object} Sink
  * @property {(tile: TileRecord, layer: number, signal: AbortSignal) => Promise<any>} decode
- * @property {(tile: TileRecord, packed: any, slot: number) => void} geometry
- * @property {(tile: TileRecord, layer: number, packed: any) => void} band
+ * @property {(tile: TileRecord, packed: any, slot: number) => void | Promise<void>} geometry
+ * @property {(tile: TileRecord, layer: number, packed: any) => void | Promise<void>} band
  * @property {(index: number) => void} evict the tile is no longer here
  * @property {(place: LayerRecord | null) => void} progress a part was read; null: everything that a view requires is here
  * @property {(error: unknown) => void} warn reports an error that leaves the scene usable: a damaged tile, for which a
@@ -45,9 +46,17 @@ import { Ranges } from './ranges.mjs';
  * @typedef {{tile: TileRecord, place: LayerRecord}} Part
  */
 
-/** Bytes that are requested together, and requests in flight; together about half a second at 10 Mbit/s. */
-const BATCH_BYTES = 1 << 18;
-const BATCHES = 3;
+/**
+/**
+ * Least and largest number of bytes that are requested together. It begins with the least, doubles when a batch is here in less
+ * than `BATCH_MS`, and is halved when a batch takes longer than four times that. What is encoded in memory is at most the
+ * largest times `BATCHES`, and one part for each request.
+ */
+export const BATCH_BYTES = [1 << 15, 1 << 20];
+const BATCH_MS = 250;
+
+/** Batches in flight, to not wait between them; of the least number of bytes, one alone, so that nothing else delays it. */
+export const BATCHES = 2;
 
 /** Splats that are kept, as a multiple of those drawn: coarser versions, a third, and what was seen before. */
 const KEPT = 2;
@@ -94,7 +103,9 @@ export class TileStream {
     /** Tiles of the coarsest version. */
     this.roots = new Set(roots.flatMap(({ firstTile, tileCount }) => tilesOf(firstTile, tileCount)));
     this.hasLevels = this.roots.size < this.all.length;
-    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * Math.max(aims.budget, this.rootSplats) : Infinity);
+    /** Number of splats that are drawn at most, unless the coarsest version has more. */
+    this.budget = Math.max(aims.budget, this.rootSplats);
+    this.memory = memoryOf(this.all, this.hasLevels ? KEPT * this.budget : Infinity);
     this.slots = new Ranges(this.memory.pages);
     /** Tiles whose layer 0 is here, and their slots. @type {Map<number, number>} */
     this.here = new Map();
@@ -108,8 +119,9 @@ export class TileStream {
     this.choices = 0;
     /** Parts in flight. @type {Map<LayerRecord, AbortController>} */
     this.pending = new Map();
-    /** Number of parts in flight by request. @type {Map<AbortController, number>} */
+    /** Number of parts in flight by batch, and when it was requested. @type {Map<AbortController, {left: number, begun: number}>} */
     this.batches = new Map();
+    this.batchBytes = BATCH_BYTES[0];
     /** Parts to decode, in this order. @type {Part[]} */
     this.queue = [];
     this.freeLanes = lanes;
@@ -192,9 +204,9 @@ export class TileStream {
       const isNext = place.layer === layer && (!isFirst || this.roots.has(tile.index));
       return isNext && !this.pending.has(place);
     });
-    while (this.batches.size < BATCHES && left.length > 0) {
+    while (this.batches.size < (this.batchBytes > BATCH_BYTES[0] ? BATCHES : 1) && left.length > 0) {
       let [bytes, count] = [0, 0];
-      while (count < left.length && bytes < BATCH_BYTES) bytes += left[count++].place.size;
+      while (count < left.length && bytes < this.batchBytes) bytes += left[count++].place.size;
       this.#request(left.splice(0, count));
     }
   }
@@ -245,7 +257,7 @@ export class TileStream {
   /** @param {Part[]} parts */
   #request(parts) {
     const controller = new AbortController();
-    this.batches.set(controller, parts.length);
+    this.batches.set(controller, { left: parts.length, begun: performance.now() });
     for (const { place } of parts) this.pending.set(place, controller);
     const layers = parts.map(({ tile, place }) => ({ tile: tile.index, layer: place.layer }));
     this.reader.prefetch(layers, { signal: controller.signal });
@@ -263,13 +275,19 @@ export class TileStream {
       if (!controller.signal.aborted) await this.#readPart(part, controller.signal);
       this.pending.delete(part.place);
       await nextTask(); // lets the camera's messages in
-      const left = /** @type {number} */ (this.batches.get(controller)) - 1;
-      this.batches.set(controller, left);
-      if (left > 0) continue;
+      const batch = /** @type {{left: number, begun: number}} */ (this.batches.get(controller));
+      if (--batch.left > 0) continue;
       this.batches.delete(controller);
+      if (!controller.signal.aborted) this.#fitBatches(performance.now() - batch.begun);
       this.readOn();
     }
     this.freeLanes++;
+  }
+
+  /** @param {number} took time of a batch, milliseconds */
+  #fitBatches(took) {
+    const factor = took < BATCH_MS ? 2 : took > 4 * BATCH_MS ? 0.5 : 1;
+    this.batchBytes = Math.min(BATCH_BYTES[1], Math.max(BATCH_BYTES[0], factor * this.batchBytes));
   }
 
   /**
@@ -281,13 +299,14 @@ export class TileStream {
     const { layer } = place;
     const begun = performance.now() - reader.waitedMs;
     try {
-      if (layer === 0) this.#takeGeometry(tile, place, await sink.decode(tile, layer, signal));
-      else if (this.here.has(tile.index)) this.#takeBand(tile, place, await sink.decode(tile, layer, signal));
+      if (layer > 0 && !this.here.has(tile.index)) return;
+      const packed = await sink.decode(tile, layer, signal);
+      amounts.decodeMs += performance.now() - reader.waitedMs - begun;
+      await (layer === 0 ? this.#takeGeometry(tile, place, packed) : this.#takeBand(tile, place, packed));
     } catch (error) {
       if (!signal.aborted) this.#refuse(tile, error);
       return;
     }
-    amounts.decodeMs += performance.now() - reader.waitedMs - begun;
     amounts.layer = layer;
     sink.progress(place);
   }
@@ -312,11 +331,14 @@ export class TileStream {
    */
   #takeGeometry(tile, place, packed) {
     const slot = this.#room(tile);
-    if (slot === null) return void this.crowded.add(tile.index);
+    if (slot === null) {
+      this.crowded.add(tile.index);
+      return;
+    }
     this.here.set(tile.index, slot);
     this.read.add(place);
     if (tile.level === 0) this.amounts.splatsDone += tile.splatCount;
-    this.sink.geometry(tile, packed, slot);
+    return this.sink.geometry(tile, packed, slot);
   }
 
   /**
@@ -329,7 +351,7 @@ export class TileStream {
     this.read.add(place);
     const isWhole = tile.layers.every((one) => one.layer > this.reader.header.shDegree || this.read.has(one));
     if (isWhole) this.reader.forget(tile.index);
-    this.sink.band(tile, place.layer, packed);
+    return this.sink.band(tile, place.layer, packed);
   }
 
   /**

@@ -164,6 +164,17 @@ declare module '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.j
     _writeStreamingSplats(first: number, count: number, rows: Uint8Array): void;
     _updateShTextureData(texture: object, data: Uint8Array, width: number, line: number, lines: number): void;
     _shTextures: object[];
+    _colorsTexture: object;
+    _vertexCount: number;
+    _getTextureSize(count: number): { x: number };
+    _updateTextureFromDataRect(
+      texture: object,
+      data: Uint8Array,
+      x: number,
+      y: number,
+      width: number,
+      height: number,
+    ): void;
     dispose(doNotRecurse?: boolean, disposeMaterialAndTextures?: boolean): void;
     updateDataAsync(data: ArrayBuffer, sh?: Uint8Array[], parts?: undefined, shDegree?: number): Promise<void>;
   }

@@ -7,8 +7,8 @@ import { CsplatReader } from '../decoder.mjs';
 import { openScene } from '../engines/scene.mjs';
 import { mirroredBand, mirroredGeometry } from '../engines/mirror.mjs';
 import {
-  alphaOf,
   places,
+  putAlphas,
   putBand,
   putColumns,
   putCovariances,
@@ -69,7 +69,7 @@ test("unpacked numbers of every vector equal the decoder's", async () => {
         floats.scales,
       );
       assert.deepEqual(
-        put(1, (to) => putColumns(tile.opacities, to, 1, alphaOf(header))),
+        put(1, (to) => putAlphas(tile, header, to[0], 1, same)),
         floats.opacities,
       );
       assert.deepEqual(

@@ -6,7 +6,9 @@ import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
 import { openScene } from '../engines/scene.mjs';
+import { FADE_STEPS } from '../levels/shown_tiles.mjs';
 import { SplatPool, poolSize } from '../levels/splat_pool.mjs';
+import { BATCHES, BATCH_BYTES, TileStream } from '../levels/tile_stream.mjs';
 import { allTiles } from '../tile_records.mjs';
 import { serve, vector } from './helpers.mjs';
 
@@ -28,6 +30,7 @@ const from = (z, scale = 1) => [scale, 0, 0, 0, 0, scale, 0, 0, 0, 0, scale, 0, 
 function recordingArrays(size) {
   const arrays = {
     owner: new Array(size).fill(null),
+    shares: new Array(size).fill(0),
     bands: Array.from({ length: size }, () => []),
     flushes: 0,
     end: 0,
@@ -40,6 +43,12 @@ function recordingArrays(size) {
       each(first, tile.count, (i) => {
         assert.equal(arrays.owner[i], null);
         arrays.owner[i] = tile;
+        arrays.shares[i] = FADE_STEPS;
+      }),
+    fade: (tile, first, shares) =>
+      each(first, tile.count, (i) => {
+        assert.equal(arrays.owner[i], tile);
+        arrays.shares[i] = shares;
       }),
     putBand: (layer, band, first, count) => each(first, count, (i) => arrays.bands[i].push(layer)),
     clear: (first, count) =>
@@ -47,11 +56,11 @@ function recordingArrays(size) {
         arrays.owner[i] = null;
         arrays.bands[i] = [];
       }),
-    flush: (changed, end) => {
+    flush: (changed, faded, end) => {
       arrays.flushes++;
       arrays.end = end;
-      assert.ok(changed.length > 0);
-      for (const [first, count] of changed) assert.ok(first >= 0 && first + count <= size);
+      assert.ok(changed.length + faded.length > 0);
+      for (const [first, count] of [...changed, ...faded]) assert.ok(first >= 0 && first + count <= size);
     },
   });
 }
@@ -102,16 +111,50 @@ test('a budget bounds the splats that are drawn, and the pool and memory with it
   const most = Math.ceil(header.splatCount / 2);
   const { scene, arrays } = await drawn(t, new Blob([vector(name)]), { maxSplats: most });
   const { levels } = scene;
-  assert.ok(poolSize(levels) <= Math.ceil(1.125 * levels.budget) + header.splatCount);
+  assert.ok(poolSize(levels.stream) <= Math.ceil(1.125 * levels.stream.budget) + header.splatCount);
   const counts = new Set();
   for (const z of [1e6, 30, 3, 0.3, 1e6, 0.1]) {
     await settled(scene, from(z));
     counts.add(levels.splatCount);
-    assert.ok(levels.splatCount <= levels.budget);
+    assert.ok(levels.splatCount <= levels.stream.budget);
     assert.equal(arrays.owner.filter(Boolean).length, levels.splatCount);
     const kept = [...levels.loaded.values()].reduce((sum, { count }) => sum + count, 0);
-    assert.ok(kept <= Math.ceil((2 * levels.budget) / 0.9));
+    assert.ok(kept <= Math.ceil((2 * levels.stream.budget) / 0.9));
   }
+});
+
+test('requests and decoded parts wait for those before them, so that a bound in bytes holds', async () => {
+  const count = 300;
+  const size = 90_000; // bytes of a part
+  const tile = (index) => ({
+    ...{ index, level: 0, splatCount: 1000, min: [index, 0, 0], max: [index + 1, 1, 1] },
+    layers: [0, 1].map((layer) => ({ layer, size, offset: size * (2 * index + layer) })),
+  });
+  const header = { tiles: Array.from({ length: count }, (_, index) => tile(index)), coarseTiles: [], shDegree: 1 };
+  let [requested, taken, decoding, placed] = [0, 0, 0, 0];
+  const prefetch = (layers) => {
+    requested += size * layers.length;
+    assert.ok(requested - taken <= BATCHES * (BATCH_BYTES[1] + size), `${requested - taken} bytes`);
+  };
+  const reader = { header, prefetch, forget: () => {}, waitedMs: 0, arrivesInOrder: false };
+  const aims = { budget: Infinity, pixels: 0, around: true };
+  const stream = await TileStream.open(reader, aims, new AbortController().signal, { lanes: 2 });
+  const place = async () => {
+    placed++;
+    await new Promise((resolve) => setTimeout(resolve, placed % 7 ? 0 : 5));
+    decoding--;
+    taken += size;
+  };
+  await new Promise((complete, reject) => {
+    stream.failed.catch(reject);
+    const decode = async () => {
+      assert.ok(++decoding <= 2);
+      return {};
+    };
+    stream.sink = { decode, geometry: place, band: place, evict: reject, warn: reject, progress: () => {}, complete };
+    stream.setView(null);
+  });
+  assert.deepEqual([placed, taken], [2 * count, requested]);
 });
 
 test('workers read the same layers, and no byte is requested twice', async (t) => {
@@ -133,15 +176,16 @@ test('a pool without a free range that is large enough is put in order', () => {
   const arrays = recordingArrays(10);
   const pool = new SplatPool(10, arrays);
   const tile = (count) => ({ count, sh: [{}, undefined, {}] });
-  for (const index of [0, 1, 2, 3]) pool.show(index, tile(2));
+  for (const index of [0, 1, 2, 3]) pool.show(index, tile(2), FADE_STEPS);
   pool.hide(0);
   pool.hide(2);
-  pool.show(4, tile(5)); // only 2, 2 and 2 are free in a row
+  pool.show(4, tile(5), 1); // only 2, 2 and 2 are free in a row
   pool.flush();
   assert.equal(arrays.owner.filter(Boolean).length, 9);
   assert.deepEqual([...pool.places.keys()], [1, 3, 4]);
   assert.deepEqual(new Set(arrays.bands.map((bands) => bands.join(' '))), new Set(['1 3', '']));
-  pool.show(5, tile(2)); // no room: it is left out
+  assert.deepEqual(arrays.shares.filter((_, i) => arrays.owner[i]).sort(), [1, 1, 1, 1, 1, 8, 8, 8, 8]);
+  pool.show(5, tile(2), FADE_STEPS); // no room: it is left out
   pool.hide(5);
   pool.band(1, 2, {});
   pool.flush();

@@ -494,6 +494,17 @@ test('who cancels a shared request cancels it for nobody else', async () => {
   assert.ok((await other.readTile(1)).count > 0);
 });
 
+test('a part is read before the rest of its request is here', { timeout: 10_000 }, async () => {
+  const end = layers[0].offset + layers[0].size;
+  const { fetch } = scripted((asked, n) => right(asked, n === 3 ? { stalls: end - asked[0] } : {}));
+  const reader = await CsplatReader.open(URL_, { ...FAST, fetch, timeoutMs: Infinity });
+  const controller = new AbortController();
+  const wanted = header.tiles.map(({ index }) => ({ tile: index, layer: 0 }));
+  reader.prefetch(wanted, { signal: controller.signal });
+  assert.equal((await reader.readLayer(0, 0)).count, header.tiles[0].splatCount);
+  controller.abort();
+});
+
 test('a refused address is renewed', async () => {
   const answer = (code) => (asked, n, url) => (url.includes('old') || n % 4 === 0 ? status(code) : right(asked));
   const renewals = {

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory.
 
-Also: csplat_tools.scene_files, csplat_tools.views.splat_spool.
+Also: csplat_tools.views.splat_spool.
 """
 
 import io

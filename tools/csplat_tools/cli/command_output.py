@@ -23,6 +23,7 @@ TRUSTS_PATHS = ContextVar("TRUSTS_PATHS", default=False)
 #: File name endings of the outputs of options.
 _ENDINGS = {
     "--report": ".json", "--page": ".html", "-o": ".html", "--source-index": ".npy", "--checkpoint": ".npz",
+    "--preview": ".png",
 }  # fmt: skip
 
 

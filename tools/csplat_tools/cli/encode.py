@@ -15,7 +15,7 @@ from csplat.errors import SearchInterrupted
 from csplat.model import SplatModel
 from csplat.out_of_core import estimate_cost
 from csplat.scene import Scene
-from csplat_render.up_estimate import estimate_up
+from csplat.scene_metadata import UP
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
@@ -33,8 +33,6 @@ from csplat_tools.level_builder import LevelCount, choose_levels
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import read_source
 from csplat_tools.views import ViewSet
-
-_UP_SPLATS = 50_000  # splats for an estimate of the up direction, about; all of a million would take 1.4 CPU s
 
 
 def encode(
@@ -59,7 +57,10 @@ def encode(
     ] = None,
     keep: shared.HiddenKeep = None,
     effort: shared.HiddenEffort = None,
-    cameras: shared.HiddenCameras = None,
+    cameras: Annotated[
+        str | None,
+        typer.Option("--cameras", metavar="FILE.json", hidden=True, help="First view; with a target, its views."),
+    ] = None,
     background: shared.HiddenBackground = None,
     importance: Annotated[
         str | None, typer.Option(metavar="FILE", hidden=True, help="File of `csplat sensitivity`, or .npy weights.")
@@ -122,12 +123,13 @@ def encode(
     shared.refuse_together(out_of_core, whole)
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
     shared.require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
-    shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
+    shared.require_one({"--effort": effort, "--background": background, "--data": data}, rendered)
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
     shared.parse_sh_degree(sh_degree)
     options = shared.checked(
         EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra
     )
+    first_view = cameras if all(value is None for value in rendered.values()) else None
     target = shared.parse_target(
         psnr=target_psnr, size=target_size, max_psnr_drop=max_psnr_drop, keep=keep, max_error=max_error,
         prune=not no_prune, effort=effort,
@@ -159,28 +161,28 @@ def encode(
         try:
             encoded = encode_file(
                 scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
-                source_index=source_index, levels=level_count, format=read_as, context=context,
+                source_index=source_index, levels=level_count, first_view=first_view, format=read_as,
+                context=context,
             )  # fmt: skip
         except SearchInterrupted as interrupt:
             if interrupt.best is not None:
-                _publish_encoded(interrupt.best, source, output, out, up=up)
+                _publish_encoded(interrupt.best, source, output, out)
             raise
-        _publish_encoded(encoded, source, output, out, up=up)
+        _publish_encoded(encoded, source, output, out)
         if level_count is None:
             written = encoded.source.changed(count=encoded.result.report.splat_count)
             out.remark(*describe_levels(written, options, context))
 
 
-def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output, *, up: str | None) -> None:
+def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output) -> None:
     """Print findings, notes, the search, errors and a line on sizes, and write the report.
 
     Args:
         encoded: the written file.
         source, output: names of the files.
         out: where to print.
-        up: the up direction that the user gave, or `None`.
     """
-    report, model = encoded.result.report, encoded.source.in_memory
+    report = encoded.result.report
     out.print_findings(encoded.source.findings)
     for line in report.notes:
         note(line)
@@ -189,10 +191,9 @@ def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output
 
         out.remark(*format_search(report.search))
     out.remark(*format_declared_errors(report.errors))
-    if not out.quiet and model is not None:
-        every = max(1, len(model) // _UP_SPLATS)
-        axis = estimate_up(model.select(slice(None, None, every)), every)
-        shared.take_estimated_up(axis, out, up=up, shown=False)
+    metadata = encoded.source.metadata
+    if UP in metadata.estimated and metadata.up is not None:
+        out.remark(f"{shared.describe_estimated_up(metadata.up)}, and stored as such: --up sets another")
     out.remark(format_encoding(encoded, source, output))
     out.publish(encoded.as_json())
 

@@ -15,7 +15,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.encode_file import read_degree
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
-from csplat_tools.scene_files import MetadataOverrides, read_source
+from csplat_tools.scene_files import MetadataOverrides, read_source, with_first_view
 
 
 def finetune(
@@ -98,7 +98,7 @@ def finetune(
         view_set = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=validation_count)
         view_set.read_images()
         result = tuning.run_finetuning(
-            model, view_set, output, encoding, options, Outputs(path, resume=resume),
+            with_first_view(scene).model(), view_set, output, encoding, options, Outputs(path, resume=resume),
             target=target, source_index=source_index, page=page,
             context=Context(progress=progress), quiet=out.quiet,
         )  # fmt: skip

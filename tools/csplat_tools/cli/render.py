@@ -94,8 +94,10 @@ def render(
         data_set = None if data is None else shared.open_data(data, size=pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
-        if orbit is not None:
-            shared.take_estimated_up(estimate_up(to_frame), out, up=up)
+        if orbit is not None and not out.quiet:
+            axis = estimate_up(to_frame)
+            if axis is not None:
+                out.remark(f"{shared.describe_estimated_up(axis)}, and used (encode --up writes it into a file)")
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,

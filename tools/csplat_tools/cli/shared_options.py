@@ -221,30 +221,9 @@ def checked(kind: Callable[..., T], *args: Any, **values: Any) -> T:
         raise typer.BadParameter(str(error)) from None
 
 
-def take_estimated_up(
-    axis: Direction | None, output: Output, *, up: object = None, shown: bool = True
-) -> Direction | None:
-    """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
-
-    Args:
-        axis: the estimate of `estimate_up`; `None`: there is none.
-        output: prints remarks.
-        up: the user's direction; `None`: not given.
-        shown: True if the command's result shows the scene with this direction up.
-    """
-    if axis is None or up is not None:
-        return None
-    word = up_word(axis)
-    output.remark(
-        _estimate_text(word)
-        + (", and used (encode --up writes it into a file)" if shown else f": --up {word} writes it")
-    )
-    return axis
-
-
-def _estimate_text(word: str) -> str:
-    """Return the clause of remarks about an estimated up direction, in the form of `up_word`."""
-    return f"the scene does not specify its up direction; {word} is estimated"
+def describe_estimated_up(up: Direction) -> str:
+    """Return the clause of remarks about an estimated up direction, such as `z`."""
+    return f"the scene does not specify its up direction; {up_word(up)} is estimated"
 
 
 def open_data(path: str, **options: Any) -> DataOptions:
@@ -322,10 +301,9 @@ class ViewOptions:
         output.remark(*view_set.notes)
         axis = None if output.quiet or view_set.name != VIRTUAL else estimate_up(model, every)
         if axis is not None:
-            word = up_word(axis)
             output.remark(
-                f"views are placed for -y up, since {_estimate_text(word)}: "
-                f"`csplat convert IN.ply OUT.ply --up {word}` writes it, and changes views and PSNR"
+                f"views are placed for -y up, since {describe_estimated_up(axis)}: "
+                f"`csplat convert IN.ply OUT.ply --up {up_word(axis)}` writes it, and changes views and PSNR"
             )
         return view_set
 

@@ -3,36 +3,40 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from csplat.context import Context
 from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
-from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
+from csplat_tools.console import format_seconds, parse_seconds
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
 from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
 _BACKGROUNDS = ", ".join(BACKGROUNDS)
-_ENGINE_HELP = "native, or torch: slower on a CPU. Default: native, with cuda torch."
+if TYPE_CHECKING:
+    from csplat_tools.training.time_plan import TrainingSettings
+
+_HOUR = 3600.0  # seconds, the default of --time
 
 
 def train(
+    context: typer.Context,
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed images.")],
     output: Annotated[str, typer.Argument(metavar="OUT", help="OUT.ply; or OUT.csplat, which is tuned as well.")],
-    max_splats: Annotated[
-        int | None, typer.Option(metavar="N", help="Largest number of splats. Default: 20,000.")
-    ] = None,
+    time: Annotated[str | None, typer.Option(metavar="TIME", help="Time for all, e.g. 30min. Default: 1h.")] = None,
+    max_splats: Annotated[int | None, typer.Option(metavar="N", help="Most splats. Default: by --time.")] = None,
     sh_degree: Annotated[
         int, typer.Option(metavar="0..4", show_default=False, help="SH degree of colours. Default: 3.")
     ] = _DEFAULT.sh_degree,
-    iterations: Annotated[
-        int, typer.Option(metavar="N", show_default=False, help="Training steps. Default: 7,000.")
-    ] = _DEFAULT.iterations,
+    iterations: Annotated[int | None, typer.Option(metavar="N", help="Training steps, instead of a time.")] = None,
     preset: shared.SmallPreset = None,
     keep: Annotated[
         float | None, typer.Option(metavar="FRACTION", help="Splats kept in OUT.csplat. Default: 0.8.")
@@ -40,15 +44,15 @@ def train(
     target_size: shared.TargetSize = None,
     target_psnr: shared.TargetPsnr = None,
     device: Annotated[
-        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
+        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu; cuda: a GPU; torch. Default: cpu.")
     ] = "cpu",
-    engine: Annotated[
-        str, typer.Option(metavar="ENGINE", hidden=True, show_default=False, help=_ENGINE_HELP)
-    ] = _DEFAULT.engine,
+    preview: Annotated[
+        str | None, typer.Option(metavar="FILE.png", help="Image and render, renewed meanwhile.")
+    ] = None,
     page: shared.Page = None,
     up: shared.HiddenUp = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images, pixels. Default: unscaled.")
+        str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images. Default: by --time.")
     ] = None,
     test_every: shared.TestEvery = None,
     background: Annotated[
@@ -58,9 +62,6 @@ def train(
     seed: Annotated[
         int, typer.Option(metavar="N", min=0, hidden=True, show_default=False, help="Random seed. Default: 0.")
     ] = _DEFAULT.seed,
-    antialiased: Annotated[
-        bool, typer.Option("--antialiased", hidden=True, help="Train with the mip-splatting filter.")
-    ] = False,
     checkpoint: shared.Checkpoint = None,
     resume: shared.Resume = None,
     force: shared.Force = False,
@@ -73,15 +74,19 @@ def train(
 
     DATA is a NeRF-synthetic folder, a transforms.json or its folder, a COLMAP
     folder, or the folder of images in one of them (garden/images_4). The test
-    images of the set, or every 8th image, are held out. OUT.csplat is tuned as
-    by `csplat finetune`, with --preset, --keep or a target. To make files of
-    several sizes, train once with --checkpoint, then use --resume (--help-all
-    shows both). With --trust-paths, DATA may name files outside of its folder.
+    images of the set, or every 8th image, are held out. A few timed steps
+    choose the size of images, splats and steps for --time; the printed command
+    makes the same file again. With --iterations, the defaults are unscaled
+    images and 20,000 splats, or as many as a --target-size holds.
+    OUT.csplat is tuned as by `csplat finetune`, with --preset, --keep or a
+    target. To make files of several sizes, train once with --checkpoint, then
+    use --resume (--help-all shows both), which takes the settings of the
+    checkpoint. With --trust-paths, DATA may name files outside of its folder.
     An interrupted run leaves OUT.npz, from which --resume continues.
 
     Examples:
-      csplat train lego lego.ply --max-splats 10000
-      csplat train garden/images_4 garden.ply --report garden.json
+      csplat train garden/images_4 garden.csplat --time 30min
+      csplat train lego lego.ply --max-splats 10000 --iterations 7000
       csplat train lego lego.csplat --target-size 800KB --checkpoint run.npz
       csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
@@ -92,44 +97,94 @@ def train(
     for name, value in {"--preset": preset, **targets}.items():
         if value is not None and not to_file:
             raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
+    shared.refuse_together({"--time": time}, {"--iterations": iterations, "--resume": resume})
+    seconds = _HOUR if time is None else shared.checked(parse_seconds, time)
     target, overrides = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep), shared.parse_overrides(up)
-    data = shared.open_data(source, size=None if size is None else shared.parse_size(size), test_every=test_every)
+    pixels = None if size is None else shared.parse_size(size)
     require_trainer(plots=page is not None)
+    from csplat_tools.training.time_plan import TrainingSettings, plan_in_time
     from csplat_tools.training.training_run import (
+        explain_size,
         plan_training,
         run_training,
         run_training_to_file,
+        splats_for,
+        stored_settings,
         tuning_after,
         tuning_checkpoint,
     )
     from csplat_tools.training.tuning_report import format_tuning_report
     from csplat_tools.training.tuning_run import SHAPE_ENTRIES
 
+    processor = {"device": "cpu", "engine": "torch"} if device == "torch" else {"device": device}
     options = shared.checked(
-        TrainOptions, max_splats=TrainOptions.max_splats if max_splats is None else max_splats, sh_degree=sh_degree,
-        iterations=iterations, seed=seed, device=device, engine=engine, background=background, antialiased=antialiased,
+        TrainOptions, sh_degree=sh_degree, seed=seed, background=background, **processor,
+        max_splats=(splats_for(target) or TrainOptions.max_splats) if max_splats is None else max_splats,
+        iterations=TrainOptions.iterations if iterations is None else iterations,
     )  # fmt: skip
-    if to_file:
-        options = plan_training(options, target, max_splats=max_splats, resume=resume)
     replaces = shared.is_same_file(checkpoint, resume)
     tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and target_psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
-    out.check(output, inputs=(source, resume), named={"--page": page, **written})
+    out.check(output, inputs=(source, resume), named={"--page": page, "--preview": preview, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
+    data = shared.open_data(source, size=pixels, test_every=test_every)
+    settings = TrainingSettings(pixels, options.max_splats, options.iterations)
+    if resume is not None:
+        settings = stored_settings(resume, size=pixels, max_splats=max_splats, iterations=iterations)
+    elif iterations is None:
+        with out.bar() as progress:
+            settings = plan_in_time(
+                data, options, seconds, to_file=to_file, max_splats=max_splats, most_splats=splats_for(target),
+                context=Context(seed=seed, progress=progress),
+            )  # fmt: skip
+        out.remark(*_describe_plan(settings, seconds, context))
+    data = replace(data, size=settings.size)
+    options = replace(options, max_splats=settings.max_splats, iterations=settings.iterations)
+    if to_file:
+        options = plan_training(options, target, max_splats=settings.max_splats)
     kept = shared.run_checkpoint(checkpoint, resume, output, lambda path: [tuning_checkpoint(path)])
     with kept as path, out.bar() as progress:
-        files, context = Outputs(path, resume=resume), Context(seed=seed, progress=progress)
+        files, run = Outputs(path, preview=preview, resume=resume), Context(seed=seed, progress=progress)
         if to_file:
             result = run_training_to_file(
                 data, output, options, files, encoding, tuning_after(training=options), target=target,
-                overrides=overrides, page=page, context=context, quiet=out.quiet,
+                overrides=overrides, page=page, context=run, quiet=out.quiet,
             )  # fmt: skip
         else:
             result = run_training(
-                data, output, options, files, overrides=overrides, page=page, context=context, quiet=out.quiet
+                data, output, options, files, overrides=overrides, page=page, context=run, quiet=out.quiet
             )
     if to_file:
-        out.remark(format_tuning_report(result["file"]))
+        out.remark(format_tuning_report(result["file"]), *explain_size(result, target))
     out.publish(result)
+
+
+def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Context) -> list[str]:
+    """Return lines on the settings of a timed training, and the command that repeats it."""
+    size = "" if settings.size is None else ", images of {}×{} pixels".format(*settings.size)
+    text = f"{settings.max_splats:,} splats, {settings.iterations:,} steps{size}"
+    late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"
+    chosen = {"--max-splats": str(settings.max_splats), "--iterations": str(settings.iterations)}
+    if settings.size is not None:
+        chosen["--size"] = "{}x{}".format(*settings.size)
+    return [
+        f"{text}; this takes about {format_seconds(settings.seconds)}{late}",
+        f"to repeat it: {_command(context, chosen)}",
+    ]
+
+
+def _command(context: typer.Context, chosen: dict[str, str]) -> str:
+    """Return the current command with its options, without --time, and with the chosen ones."""
+    words = ["csplat", *(["--trust-paths"] if TRUSTS_PATHS.get() else []), "train"]
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if source is None or source.name != "COMMANDLINE":
+            continue
+        value, name = context.params.get(parameter.name or ""), parameter.opts[0]
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif name != "--time" and name not in chosen:
+            words += [name] if value is True else [name, str(value)]
+    return shlex.join([*words, *(word for pair in chosen.items() for word in pair)])

@@ -22,7 +22,6 @@ from csplat_tools.file_streams import check_name, write_bytes
 from csplat_tools.present import viewer_page
 from csplat_tools.present.viewer_server import (
     ViewerScene,
-    estimated_up_parameters,
     open_server,
     open_viewer_scene,
     page_parameters,
@@ -30,7 +29,7 @@ from csplat_tools.present.viewer_server import (
 
 _PORT_MAX = 65_535
 _Cameras = Annotated[
-    str | None, typer.Option("--cameras", metavar="FILE.json", help="First views. Default: around the scene.")
+    str | None, typer.Option("--cameras", metavar="FILE.json", help="First views. Default: the file's.")
 ]
 _PRESETS: tuple[PresetName, PresetName] = ("fast", "balanced")  # for `view`, for `export-html`
 
@@ -71,7 +70,7 @@ def view(
         with out.bar() as progress:
             context = Context(progress=progress)
             scene = stack.enter_context(open_viewer_scene(source, preset=_PRESETS[0], context=context))
-        wishes |= _scene_parameters(scene, cameras, up, out)
+        wishes |= _scene_parameters(scene, cameras, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.print_findings(scene.findings)
@@ -120,7 +119,7 @@ def export_html(
     ):
         data = scene.read()
         decode_scene(data)
-        wishes |= _scene_parameters(scene, cameras, up, out)
+        wishes |= _scene_parameters(scene, cameras, out)
         exported = viewer_page.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.print_findings(scene.findings)
@@ -163,14 +162,14 @@ def export_element(
     out.publish({"size_bytes": len(script)})
 
 
-def _scene_parameters(scene: ViewerScene, cameras: str | None, up: str | None, out: Output) -> dict[str, str]:
-    """Return the page's parameters of a scene: cameras relative to its origin, and the estimated up direction."""
-    wishes = {}
-    if cameras is not None:
-        notes: list[str] = []
-        wishes = page_parameters(cameras, report=notes, origin=scene.header.origin)
-        out.remark(*notes)
-    return wishes | estimated_up_parameters(shared.take_estimated_up(scene.seems_up, out, up=up))
+def _scene_parameters(scene: ViewerScene, cameras: str | None, out: Output) -> dict[str, str]:
+    """Return the page's parameters of a scene: cameras relative to its origin."""
+    if cameras is None:
+        return {}
+    notes: list[str] = []
+    wishes = page_parameters(cameras, report=notes, origin=scene.header.origin)
+    out.remark(*notes)
+    return wishes
 
 
 def _encoding_lines(scene: ViewerScene, preset: str) -> list[str]:

@@ -14,10 +14,9 @@ import numpy as np
 from csplat.encode_api import encode
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
+from csplat_render.first_view import viewing_metadata
 from csplat_render.scene_frame import surface_areas, visible_opacity
-from csplat_render.up_estimate import estimate_up
 from csplat_tools.present.viewer_page import export_page
-from csplat_tools.present.viewer_server import estimated_up_parameters
 
 #: Largest number of splats in a frame; each adds about 12 bytes to the notebook.
 MOST_SPLATS = 250_000
@@ -39,9 +38,8 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
         InputError: the scene cannot be encoded, or the installation is incomplete.
     """
     shown = most_visible(model, most_splats)
-    wishes = estimated_up_parameters(estimate_up(shown))
-    data = encode(shown, EncodeOptions(preset="fast"))
-    page = export_page(data, "scene", wishes).page.decode()
+    data = encode(shown.with_metadata(viewing_metadata(shown)), EncodeOptions(preset="fast"))
+    page = export_page(data, "scene").page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'
         f' style="width: 100%; height: {_HEIGHT}px; border: 0"></iframe>'

@@ -27,21 +27,19 @@ from urllib.parse import quote, unquote, urlencode, urlsplit
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.context import DEFAULT_CONTEXT, Context
-from csplat.decoder import SceneHeader, decode, read_header
+from csplat.decoder import SceneHeader, read_header
 from csplat.encode_api import encode
 from csplat.encoder import EncodeOptions, PresetName
-from csplat.errors import CsplatError, FormatError, InputError
+from csplat.errors import FormatError, InputError
 from csplat.file_source import open_binary, read_bytes
 from csplat.lint import Finding
-from csplat.scene_metadata import UNSPECIFIED, Direction
+from csplat.scene_metadata import Direction
 from csplat_render.camera_files import load_cameras
-from csplat_render.up_estimate import estimate_up
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 from csplat_tools.present.viewer_page import PAGE, web_files
-from csplat_tools.scene_files import MetadataOverrides, read_source
+from csplat_tools.scene_files import MetadataOverrides, read_source, with_first_view
 
 _NONE = MetadataOverrides()
-_UP_SPLATS_MAX = 2_000_000  # splats; the up direction of larger files is not estimated, since that decodes them
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -88,7 +86,6 @@ class ViewerScene:
         content: path of the file, or its bytes.
         size_bytes: size of the file.
         header: header of the file.
-        seems_up: estimated up direction, if the scene does not specify one.
         findings: lint findings in the source.
         encoded_from: size of the source in bytes; 0 if it is a .csplat file.
     """
@@ -97,7 +94,6 @@ class ViewerScene:
     content: Path | bytes
     size_bytes: int
     header: SceneHeader
-    seems_up: Direction | None = None
     findings: tuple[Finding, ...] = ()
     encoded_from: int = 0
 
@@ -247,11 +243,6 @@ def page_parameters(
     return wishes
 
 
-def estimated_up_parameters(up: Direction | None) -> dict[str, str]:
-    """Return the parameters of the page for an estimated up direction, which has the lowest priority."""
-    return {} if up is None else {"seems": _format_direction(up)}
-
-
 def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
     """Parse a Range header (RFC 9110, 14.2).
 
@@ -323,17 +314,7 @@ def _check_scene(path: Path, stem: str) -> ViewerScene:
             else (ERROR_TRAILING, header.file_size, "HDR-6", "bytes follow the end of the file")
         )
         raise FormatError(code, offset, clause, detail, found=f"{size} bytes", wanted=f"{header.file_size} bytes")
-    return ViewerScene(f"{stem}.csplat", path, size, header, _estimate_file_up(path, header))
-
-
-def _estimate_file_up(path: Path, header: SceneHeader) -> Direction | None:
-    """Return the estimated up direction; `None` if the scene has axes, too many splats, or does not decode."""
-    if header.splat_count > _UP_SPLATS_MAX or header.coordinate_system != UNSPECIFIED:
-        return None
-    try:
-        return estimate_up(decode(path, sh_degree=0))
-    except CsplatError:
-        return None  # the page shows the intact part, and reports the error
+    return ViewerScene(f"{stem}.csplat", path, size, header)
 
 
 def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -> ViewerScene:
@@ -342,10 +323,9 @@ def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -
     Raises:
         CsplatError: the scene is not valid.
     """
-    source = read_source(str(path), context=context)
+    source = with_first_view(read_source(str(path), context=context))
     data = encode(source.model(), EncodeOptions(preset=preset), context=context)
-    header, up = read_header(data), estimate_up(source.model())
-    return ViewerScene(f"{stem}.csplat", data, len(data), header, up, tuple(source.findings), source.size_bytes)
+    return ViewerScene(f"{stem}.csplat", data, len(data), read_header(data), tuple(source.findings), source.size_bytes)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
-from csplat_tools.console import note, step_progress
+from csplat_tools.console import format_bytes, note, step_progress
 from csplat_tools.file_streams import write_model
 from csplat_tools.scene_files import MetadataOverrides
+from csplat_tools.training.time_plan import TrainingSettings, expected_seconds
 from csplat_tools.training.tuning_report import describe_step, show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, paced, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
@@ -30,6 +32,9 @@ from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
 _KEEP = 0.8  # default fraction of the trained splats that a file keeps: some of them are hardly seen
+_BRIEF_TUNING = 1 / 4  # the same of trainings so short that it is fewer than the usual steps of a tuning
+_ANNOUNCED_FROM = 100  # steps; a few are timed before longer trainings
+_MUCH_SMALLER = 0.9  # fraction of its largest size below which a file is explained
 _BRIEF = 4_000  # training steps up to which the tuning uses full learning rates; later they gain nothing
 
 
@@ -132,12 +137,18 @@ def run_training_to_file(
     return {"training": result.log, "file": report}
 
 
+def splats_for(target: Target | None) -> int | None:
+    """Return the number of splats to train for a size, a quarter more than are kept; `None` without a size."""
+    return None if target is None or target.size_bytes is None else round(_kept_for(target.size_bytes) / _KEEP)
+
+
+def _kept_for(size_bytes: int) -> int:
+    """Return the number of splats that a file of a size keeps."""
+    return max(1, size_bytes // SPLAT_BYTES)
+
+
 def plan_training(
-    options: TrainOptions,
-    target: Target | None = None,
-    *,
-    max_splats: int | None = None,
-    resume: str | Path | None = None,
+    options: TrainOptions, target: Target | None = None, *, max_splats: int | None = None
 ) -> TrainOptions:
     """Return the options of a training before a tuning: the number of splats, and the fraction to keep.
 
@@ -145,29 +156,67 @@ def plan_training(
         options: the other options.
         target: the target of the file. A fraction to keep refers to the trained splats. A size leaves one splat per
             `SPLAT_BYTES`. A PSNR leaves all, since the tuning prunes. `None`: 0.8 are kept.
-        max_splats: number of splats to train; `None`: for a size a quarter more than are kept, otherwise the default.
-            With `resume`, for a size or a PSNR, the number in the checkpoint.
-        resume: the checkpoint that the training resumes from, if any.
+        max_splats: number of splats to train; `None`: `splats_for` the target, otherwise the default.
 
     Raises:
-        InputError: the target is of another kind, or the checkpoint is damaged.
+        InputError: the target is of another kind.
     """
+    if max_splats is None:
+        max_splats = splats_for(target) or TrainOptions.max_splats
+    share = _KEEP
     if target is not None:
         target.require("train", "psnr", "size", "keep")
-        if max_splats is None and resume is not None and target.keep is None:
-            max_splats = load_checkpoint(resume).options.get("max_splats")
-    share = _KEEP
-    if target is not None and target.size_bytes is not None:
-        kept_count = max(1, target.size_bytes // SPLAT_BYTES)
-        max_splats = round(kept_count / _KEEP) if max_splats is None else max_splats
-        share = min(1.0, kept_count / max_splats)
-    elif target is not None:
-        share = 1.0 if target.keep is None else target.keep
-    return replace(options, max_splats=TrainOptions.max_splats if max_splats is None else max_splats, final_share=share)
+        if target.size_bytes is not None:
+            share = min(1.0, _kept_for(target.size_bytes) / max_splats)
+        else:
+            share = 1.0 if target.keep is None else target.keep
+    return replace(options, max_splats=max_splats, final_share=share)
+
+
+def stored_settings(
+    checkpoint: str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    max_splats: int | None = None,
+    iterations: int | None = None,
+) -> TrainingSettings:
+    """Return the settings of the training that a checkpoint is of, or those that are given instead.
+
+    Raises:
+        InputError: the checkpoint is damaged.
+    """
+    stored = load_checkpoint(checkpoint)
+    known, count, steps = (stored.own.get("size"), *map(stored.options.get, ("max_splats", "iterations")))
+    if not isinstance(count, int) or not isinstance(steps, int):
+        raise InputError(f"{checkpoint} lacks the options of its training, expected max_splats and iterations")
+    if size is None and isinstance(known, list) and len(known) == 2 and all(isinstance(side, int) for side in known):
+        size = known[0], known[1]
+    return TrainingSettings(size, max_splats or count, iterations or steps)
+
+
+def explain_size(result: Mapping[str, Any], target: Target | None) -> list[str]:
+    """Return a line on what limits a file that is much smaller than its largest size; no line if it is not.
+
+    Args:
+        result: result of `run_training_to_file`.
+        target: the target of the file.
+    """
+    training, file = result["training"], result["file"]
+    if target is None or target.size_bytes is None or file["size_bytes"] >= _MUCH_SMALLER * target.size_bytes:
+        return []
+    count, most, steps = training["splat_count"], training["options"]["max_splats"], training["options"]["iterations"]
+    text = f"{format_bytes(target.size_bytes)} do not bind: {format_bytes(file['size_bytes'])} hold"
+    if count >= _kept_for(target.size_bytes):
+        return [f"{text} the {file['splats']:,} splats; more need a larger --max-splats than {most:,}"]
+    if count >= most:
+        return [f"{text} the {count:,} splats that --max-splats allows, the size {_kept_for(target.size_bytes):,}"]
+    return [f"{text} the {count:,} splats to which {counted(steps, 'step')} grew the scene; more --iterations add some"]
 
 
 def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
     """Return the options of the tuning after a training: the longer the training, the more and smaller steps.
+
+    A sixth of the training's steps, but at least the usual number, or a quarter of the training's if that is less.
 
     Args:
         training: options of the training.
@@ -178,9 +227,15 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
     """
     usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
-    steps = max(usual.iterations, round(_TUNING * training.iterations))
+    least = min(usual.iterations, max(1, round(_BRIEF_TUNING * training.iterations)))
+    steps = max(least, round(_TUNING * training.iterations))
+    warm_up = min(usual.warm_up, steps // 10)
     engine, device = training.engine, training.device
-    return paced(replace(tuning, iterations=steps, lr_exposure=training.lr_exposure, device=device, engine=engine))
+    return paced(
+        replace(
+            tuning, iterations=steps, warm_up=warm_up, lr_exposure=training.lr_exposure, device=device, engine=engine
+        )
+    )
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
@@ -213,8 +268,16 @@ def _train(
     """
     for line in () if quiet else data_set.report:
         note(line)
+    context.progress("reading images", 0.0)
     data_set.read()  # to find damaged images before the first step
-    with thread_count(context.threads), step_progress("training", describe_step, quiet=quiet) as show:
+    context.progress("reading images", 1.0)
+    done = 0 if files.resume is None else load_checkpoint(files.resume).iteration
+    is_long = not quiet and options.iterations - done >= _ANNOUNCED_FROM
+    expected = expected_seconds(data_set, options, done, context) if is_long else None
+    with (
+        thread_count(context.threads),
+        step_progress("training", describe_step, expected=expected, quiet=quiet) as show,
+    ):
         result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data_set.name).name)
@@ -236,7 +299,7 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
     """Check small inputs before the data set is read, which takes long.
 
     Raises:
-        InputError: weights, checkpoint, torch or GPU are missing or damaged, or the path of previews is not a folder.
+        InputError: weights, checkpoint, torch or GPU are missing or damaged.
     """
     if uses_torch(options.device, options.engine):
         make_rasteriser(options.device, antialiased=options.antialiased)
@@ -246,8 +309,6 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
         load_lpips(files.lpips_weights)
     if files.resume is not None:
         load_checkpoint(files.resume)
-    if files.previews is not None and Path(files.previews).exists() and not Path(files.previews).is_dir():
-        raise InputError(f"{files.previews} is not a folder")
 
 
 def _summarise_training(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:

@@ -23,7 +23,7 @@ from csplat.model import SplatModel
 from csplat.types import F32, I64, null_progress
 from csplat_render import Camera
 from csplat_render.kernels import thread_count
-from csplat_render.metrics import Distance
+from csplat_render.metrics import Distance, psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_tools.console import step_progress
 from csplat_tools.file_streams import write_array, write_bytes
@@ -495,7 +495,10 @@ class Tuner:
         if reached:
             return min(reached, key=lambda subset: subset.size_bytes)
         best = max(made, key=lambda subset: subset.psnr)
-        raise InputError(f"{target.psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
+        text = f"{target.psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB"
+        if missed > 0.0:
+            text += f", the scene itself {psnr_of_mse(missed):.2f} dB: train it in more steps, or with more splats"
+        raise InputError(text)
 
     def _image_error(self, model: SplatModel) -> float:
         """Return the mean squared error of a scene against the validation images; 0 without images."""

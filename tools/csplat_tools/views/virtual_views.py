@@ -228,11 +228,11 @@ def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
     """
     frame = scene_frame(source)
     others = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
-    groups = {"beside": others, "farther": [_at(camera, frame.centre, _FARTHER) for camera in others]}
+    groups = {"beside": others, "farther": [at_distance(camera, frame.centre, _FARTHER) for camera in others]}
     if not len(source):
         return {**groups, "nearer": others}
     cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
-    candidates = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in others]
+    candidates = [[at_distance(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in others]
     nearer = [
         next((camera for camera in distances if is_clear(frame, cloud, camera)), distances[-1])
         for distances in candidates
@@ -240,8 +240,8 @@ def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
     return {**groups, "nearer": nearer}
 
 
-def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
-    """Multiply the distance of a camera from a centre."""
+def at_distance(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
+    """Multiply the distance of a camera from a centre, [3], which it sees in the same direction as before."""
     turn = camera.viewmat[:3, :3]
     eye = -turn.T @ camera.viewmat[:3, 3]
     return relative_to((1.0 - times) * (eye - centre), camera)

@@ -25,6 +25,7 @@ class Line:
     """A server of folders that records what was sent when.
 
     Attributes:
+        bits_per_second: its bandwidth, over all connections together; may be changed between two loads.
         sent: times, in seconds since the epoch, and bytes of bodies that were handed to the system then.
         begun: time of the first request, seconds since the epoch; `None` before.
     """
@@ -32,7 +33,7 @@ class Line:
     def __init__(self, bits_per_second: float, latency_seconds: float) -> None:
         self.sent: list[tuple[float, int]] = []
         self.begun: float | None = None
-        self._bytes_per_second = bits_per_second / 8.0
+        self.bits_per_second = bits_per_second
         self._latency = latency_seconds
         self._lock = threading.Lock()
         self._free = 0.0  # monotonic time, seconds, at which all requested bytes will have passed
@@ -78,7 +79,7 @@ class Line:
     def wait_for(self, size: int) -> None:
         """Wait until `size` bytes have passed, after those of other requests."""
         with self._lock:
-            self._free = max(self._free, time.monotonic()) + size / self._bytes_per_second
+            self._free = max(self._free, time.monotonic()) + 8.0 * size / self.bits_per_second
             wait = self._free - time.monotonic()
         time.sleep(max(0.0, wait))
 

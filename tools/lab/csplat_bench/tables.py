@@ -100,8 +100,7 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
             fields; `where`, allowed values by field, which also give the order; `group` and `by`: rows with equal
             fields `group` are merged into one, and the other fields of a row with `by = VALUE` are renamed to
             `VALUE.FIELD`. A row without `series` gets its `case`. If there are published figures, a measured row gets
-            `source_psnr`, the PSNR of the row of its scene whose `case` is `trained`, and the fields that it lacks of
-            `fill`, templates by field.
+            the fields that it lacks of `fill`, templates by field.
         folder: folder of the JSON files.
 
     Raises:
@@ -113,7 +112,8 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     rows = [flatten(row) for file in files if file.suffix != ".toml" for row in _read(file, spec.get("rows", "rows"))]
     if published:
         measured = [row for row in rows if "published" not in row]
-        rows = [*_completed(measured, spec.get("trained"), spec.get("fill", {})), *published]
+        fill = spec.get("fill", {}).items()
+        rows = [*({**{name: cell(template, row) for name, template in fill}, **row} for row in measured), *published]
     rows = [{"series": row["case"], **row} if "case" in row else row for row in rows]
     for field, values in reversed(spec.get("where", {}).items()):
         order = {value: position for position, value in enumerate(_as_list(values))}
@@ -123,13 +123,6 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     if not rows:
         raise ValueError(f"{spec['source']}: no row is left, expected some with {spec.get('where', {})}")
     return rows
-
-
-def _completed(rows: Sequence[Row], trained: str | None, fill: Mapping[str, str]) -> Iterator[dict[str, Any]]:
-    sources = {row["scene"]: row["psnr_mean"] for row in rows if row.get("case") == trained}
-    for row in rows:
-        found = {"source_psnr": sources.get(row.get("scene")), **row}
-        yield {**{name: cell(template, row) for name, template in fill.items()}, **found}
 
 
 def flatten(row: Row, prefix: str = "") -> dict[str, Any]:

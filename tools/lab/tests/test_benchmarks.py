@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import sys
 import threading
@@ -30,8 +31,9 @@ from csplat.ply import read_ply
 from csplat_bench import data_set_folders, results
 from csplat_bench.__main__ import main
 from csplat_bench.made_scenes import crowd, split
+from csplat_bench.pages import RESULTS, ROOT
 from csplat_bench.protocol import AbsentError, Setup
-from csplat_bench.published import PUBLISHED, read_published
+from csplat_bench.published import PUBLISHED
 from csplat_bench.results import Results
 from csplat_bench.rules import bytes_at, mark_beaten, mean_rows, size_ratios, summarise_turns
 from csplat_bench.runner import run_suite
@@ -330,14 +332,12 @@ def test_published_figures_of_scenes_give_the_published_means():
                 assert printed[key] == pytest.approx(np.mean([one[key] for one in scenes]), abs=tolerance)
 
 
-def test_published_means_of_curves_are_those_of_the_scenes():
-    rows = [row for row in read_published(PUBLISHED / "methods.toml") if row["case"].startswith(("KISS", "FCGS"))]
-    means = {(row["scene"], row["case"], row.get("tier")): row for row in rows if "-" not in row["scene"]}
-    assert 4 * 7 + 3 * 2 == len(means)
-    for (name, *kind), mean in means.items():
-        scenes = [row for row in rows if row["scene"].startswith(f"{name}-") and [row["case"], row.get("tier")] == kind]
-        for key in ("size_bytes", "psnr_mean", "ssim", "lpips_vgg"):
-            assert mean[key] == pytest.approx(np.mean([row[key] for row in scenes]), rel=1e-4)
+def test_constants_of_recorded_choices_are_in_the_code():
+    """A constant that is renamed or removed takes its record along."""
+    packages = [ROOT / "codec" / "csplat", ROOT / "tools" / "csplat_tools", ROOT / "trainer"]
+    code = "\n".join(path.read_text("utf-8") for package in packages for path in package.rglob("*.py"))
+    words, recorded = set(re.findall(r"\w+", code)), tomllib.loads((RESULTS / "choices.toml").read_text("utf-8"))
+    assert [] == [name for one in recorded["choices"] for name in one.get("constants", []) if name not in words]
 
 
 def test_results_are_shown_next_to_published_figures(tmp_path):
@@ -346,12 +346,10 @@ def test_results_are_shown_next_to_published_figures(tmp_path):
     (tmp_path / "r.json").write_text(json.dumps({"rows": [*measured, copied]}))
     head = '[[methods]]\ncase = "X"\nnetwork = true\npublished = "p"\nfields = ["psnr_mean"]\n'
     (tmp_path / "p.toml").write_text(f"{head}[methods.rows]\na = [[28.5]]\n")
-    spec = {
-        "source": ["r.json", "p.toml"], "trained": "PLY", "fill": {"network": "no"}, "where": {"case": ["X", "1 MB"]}
-    }  # fmt: skip
-    columns = [["", "{psnr_mean}"], ["", "{source_psnr} dB", "as {published}"], ["", "{network}"]]
+    spec = {"source": ["r.json", "p.toml"], "fill": {"network": "no"}, "where": {"case": ["X", "1 MB"]}}
+    columns = [["", "{psnr_mean}"], ["", "as {published}", "ours"], ["", "{network}"]]
     table = markdown_table(select_rows(spec, tmp_path), columns, {"True": "yes"})
-    assert ["| 28.5 | as p | yes |", "| 29.0 | 30.0 dB | no |"] == table.split("\n")[2:]
+    assert ["| 28.5 | as p | yes |", "| 29.0 | ours | no |"] == table.split("\n")[2:]
 
 
 def test_published_rows_follow_the_scenes_and_sets_that_were_measured(tmp_path):
@@ -494,6 +492,10 @@ name = "free"
 of = "few"
 command = "finetune {{ply}} {{file}} --data {{data}} --iterations 20 --lambda 0"
 without = "a rate term"
+[[cases]]
+name = "{{steps}} steps"
+each.steps = [20]
+command = "train {{data}} {{file}} --max-splats 30 --sh-degree 0 --iterations {{steps}} --size 12x8"
 [table]
 columns = [["file", "{{case}}"], ["dB", "{{psnr_mean:.2f}}"], ["series", "{{series}}"]]
 """
@@ -506,11 +508,12 @@ def test_files_of_photographs_are_trained_made_and_scored(tmp_path):
     status, found = run(tmp_path / "dots.toml", tmp_path)
     assert 0 == status
     rows = {row["case"]: row for row in found["rows"] if "published" not in row}
-    assert ["few", "more", "kept", "encoded", "free"] == list(rows)
+    assert ["few", "more", "kept", "encoded", "free", "20 steps"] == list(rows)
     work = tmp_path / "work" / "photographs"
     assert len(read_ply(work / "lego800-more.ply")) == rows["more"]["splats"] == rows["encoded"]["splats"]
     assert rows["kept"]["splats"] < rows["encoded"]["splats"]
     assert rows["free"]["size_bytes"] == (work / "lego800-free.csplat").stat().st_size
+    assert (30, 20, "12×8") == tuple(rows["20 steps"][name] for name in ("max_splats", "iterations", "images"))
     assert "csplat finetune, without a rate term" == rows["free"]["series"]
     assert all(row["psnr_mean"] > 5.0 and row["seconds"] > 0.0 for row in rows.values())
     assert {"HAC++", "MesonGS"} < {row["case"] for row in found["rows"] if "published" in row}

@@ -3,7 +3,8 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { CameraList } from '../camera_list.mjs';
+import { CameraList, emptyPose } from '../camera_list.mjs';
+import { OrbitCamera } from '../orbit_camera.mjs';
 
 /** A camera of a file, level if +z is up. */
 const LEVEL = {
@@ -23,9 +24,9 @@ const LEVEL = {
 };
 
 function opened({ axes = '', metadata = null, cameras = null }, wanted = {}) {
-  const view = new CameraList(null, { touched: false }, { up: null, axes: null, seems: null, ...wanted });
+  const view = new CameraList(null, { touched: false }, { up: null, axes: null, ...wanted });
   view.begin();
-  view.read({ axes }, { metadata, cameras });
+  view.read({ axes, tiles: [] }, { metadata, cameras });
   return view;
 }
 
@@ -38,17 +39,6 @@ test('the up direction of the user comes first, then that of metadata, axes and 
   assert.deepEqual(opened({ ...said, metadata: null }).up, [0, 1, 0]);
   assert.deepEqual(opened({ cameras: [LEVEL] }).up, [0, 0, 1]);
   assert.deepEqual(opened({}).up, [0, -1, 0]);
-});
-
-test('the estimated up direction is used last, and only for the first scene', () => {
-  const seems = [0, 0, 1];
-  assert.deepEqual(opened({ axes: 'RUB' }, { seems }).up, [0, 1, 0]);
-  const view = opened({}, { seems });
-  assert.deepEqual(view.up, seems);
-  assert.ok(view.knowsUp);
-  view.begin();
-  view.read({ axes: '' }, { metadata: null, cameras: null });
-  assert.deepEqual(view.up, [0, -1, 0]);
 });
 
 test('no other up direction is offered if it is known', () => {
@@ -70,4 +60,25 @@ test('invalid metadata are ignored', () => {
     assert.deepEqual(opened({ axes: 'RFU', metadata: { up } }).up, [0, 0, 1]);
     assert.ok(!opened({ metadata: { up } }).knowsUp);
   }
+});
+
+test('the first view is placed when the header is here, and stays when the splats arrive', () => {
+  const rig = new OrbitCamera(emptyPose(), 1);
+  const moves = [];
+  const controls = { touched: false, glide: (pose) => moves.push((rig.pose = pose)) };
+  for (const metadata of [null, { view: { ...LEVEL, from: 'author' } }]) {
+    const view = new CameraList(rig, controls, { up: null, axes: null });
+    const header = { axes: '', tiles: [{ min: [-1, 4, -1], max: [1, 6, 1], splatCount: 9 }] };
+    view.read(header, { metadata, cameras: null });
+    const corners = { samples: Float32Array.of(-1, 4, -1, 1, 6, 1), weights: Float32Array.of(9, 9) };
+    assert.ok(view.place(corners));
+    const first = rig.camera(80, 60);
+    assert.ok(!view.place(corners));
+    const wall = Float32Array.from({ length: 3000 }, (_, i) => (i % 3 === 1 ? 4.5 : Math.sin(i)));
+    assert.ok(!view.place({ samples: wall, weights: new Float32Array(1000).fill(0.01) }));
+    assert.deepEqual(rig.camera(80, 60), first);
+    assert.equal(rig.home, rig.pose);
+  }
+  assert.equal(moves.length, 2);
+  assert.equal(rig.pose.distance, 4.5); // the pivot lies on the surface
 });

@@ -5,8 +5,8 @@ import { readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
-import { readCamera } from '../autocamera.mjs';
-import { saveUpCommand, upWord } from '../save_up.mjs';
+import { readCamera } from '../../../codec/js/first_view.mjs';
+import { roundedCamera, saveCommand, upWord } from '../save_offer.mjs';
 import { explain } from '../messages.mjs';
 import { readCameras, readWishes } from '../page.mjs';
 
@@ -18,7 +18,6 @@ test('an empty address has no parameters', () => {
     camera: null,
     view: 0,
     up: null,
-    seems: null,
     axes: null,
     size: null,
     background: null,
@@ -206,12 +205,18 @@ test('a PLY is recognised by its name', () => {
   assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.zip').title, /not a \.csplat/);
 });
 
-test('the command that saves the up direction can be pasted into a shell', () => {
-  assert.equal(saveUpCommand('scene.csplat', [0, 0, 1]), 'csplat encode scene.ply scene.csplat --up z');
-  assert.equal(saveUpCommand('a.b.CSPLAT', [0, -1, -0]), 'csplat encode a.b.ply a.b.csplat --up -y');
+test('the command that saves up direction and first view can be pasted into a shell', () => {
+  assert.equal(saveCommand('scene.csplat', { up: [0, 0, 1] }), 'csplat encode scene.ply scene.csplat --up z');
+  assert.equal(saveCommand('a.b.CSPLAT', { up: [0, -1, -0] }), 'csplat encode a.b.ply a.b.csplat --up -y');
   assert.equal(
-    saveUpCommand("my dog's $HOME.csplat", [1, 0, 0]),
+    saveCommand("my dog's $HOME.csplat", { up: [1, 0, 0] }),
     "csplat encode 'my dog'\\''s $HOME.ply' 'my dog'\\''s $HOME.csplat' --up x",
   );
+  const view = { K: [[1 / 3]], viewmat: [[-0, 1e-9]], W: 4, H: 3, near: 0.2 };
+  assert.equal(
+    saveCommand('scene.csplat', { view, up: [0, 0, 1] }),
+    'csplat encode scene.ply scene.csplat --cameras view.json --up z',
+  );
+  assert.deepEqual(roundedCamera(view), { ...view, K: [[0.3333333]], viewmat: [[0, 1e-9]] });
   assert.equal(upWord([-0.006123456, -0.8760004, 0.4822]), '-0.006123,-0.876,0.4822');
 });

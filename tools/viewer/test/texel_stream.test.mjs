@@ -242,6 +242,22 @@ test('what is not required any more is cancelled', async () => {
   assert.ok(inFlight.every(({ signal }) => signal.aborted));
 });
 
+test('of a file without levels, the first tile is requested alone', async () => {
+  const { requests, options } = served(bytes('valid/rich'));
+  const sink = collector();
+  const { signal } = new AbortController();
+  const stream = await TexelStream.open('http://example.test/a', sink, AIMS, signal, options);
+  stream.tiles.batchBytes = 1; // less than a tile has
+  const before = requests.length;
+  const first = new Promise((resolve) => (sink.geometry = () => resolve(requests.slice(before))));
+  stream.tiles.setView(viewFrom(-1e4));
+  const [{ layers }] = stream.reader.header.tiles;
+  assert.deepEqual(
+    (await first).map(({ end }) => end),
+    [layers[0].offset + layers[0].size],
+  );
+});
+
 test('a damaged tile is reported, and the node above it stays', async () => {
   const damaged = Uint8Array.from(LEVELS);
   const [{ index, layers }] = readHeader(LEVELS).tiles;

@@ -51,7 +51,7 @@ return error.hidden ? csplatViewer.engine.stats.splatsDrawn : document.getElemen
 _OTHER = """
 const bytes = Uint8Array.from(atob(%s), (letter) => letter.charCodeAt(0));
 await csplatViewer.show(new File([bytes], 'other.csplat'), 'other.csplat');
-const written = await csplatViewer.engine.fileWithUp([0, 0, 1]);
+const written = await csplatViewer.engine.fileWith({ up: [0, 0, 1] });
 return btoa(Array.from(written, (byte) => String.fromCharCode(byte)).join(''));"""
 _ASYNC = "const done = arguments[arguments.length - 1]; (async () => {%s})().then(done, (e) => done('failed: ' + e));"
 

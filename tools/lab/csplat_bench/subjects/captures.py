@@ -43,7 +43,7 @@ from csplat_bench.suites import Case
 from csplat_render.lpips import load_lpips
 from csplat_tools.console import note
 from csplat_tools.file_streams import write_bytes
-from csplat_tools.training.training_run import plan_training, tuning_after
+from csplat_tools.training.training_run import plan_training, stored_settings, tuning_after
 from csplat_tools.training.tuning_run import SHAPE_ENTRIES, choose_and_finetune
 from csplat_tools.views import find_view_set
 from csplat_trainer.data import DataSet, load
@@ -53,7 +53,6 @@ from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs, TrainOptions
 
 _NOTES = 5  # lines of progress of a training
-_CHECKPOINTS = 5  # checkpoints of a training
 
 
 def scene_keys(setup: Setup, names: Sequence[str]) -> list[str]:
@@ -117,8 +116,7 @@ def _train(ply: Path, data: DataSet, options: TrainOptions) -> dict[str, Any]:
 
     checkpoint = ply.with_suffix(".npz")
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    every_steps = max(1, options.iterations // _CHECKPOINTS)
-    outputs = Outputs(checkpoint, every_steps, resume=checkpoint if checkpoint.exists() else None)
+    outputs = Outputs(checkpoint, resume=checkpoint if checkpoint.exists() else None)
     result = train(replace(data, test=[]), options, outputs=outputs, on_step=show)
     # The record first: a PLY without one counts as that of another trainer.
     write_json(record, {"options": asdict(options), "seconds": result.log["seconds"]})
@@ -136,7 +134,7 @@ def _tuned(ply: Path, data: DataSet, options: TrainOptions, megabytes: float) ->
         target, start = Target(size=round(1e6 * megabytes)), time.perf_counter()
         trained = train(
             replace(data, test=[]),
-            plan_training(options, target, resume=checkpoint),
+            plan_training(options, target, max_splats=stored_settings(checkpoint).max_splats),
             outputs=Outputs(resume=checkpoint),
         )
         pruning = time.perf_counter() - start

@@ -8,6 +8,7 @@ A case is one of
     of = "40k", target_size = "0.1MB"                    # a file by the end of a training; also keep, target_psnr,
                                                          # lambda, final_share
     of = "40k", command = "finetune {ply} {file} --data {data} --preset small"    # a file by a command
+    command = "train {data} {file} --time 10min"                                  # the same without a training before
 
 Seconds are those of one training or file, without those that it builds on. Trainings stay in the work folder. PSNR is
 the mean over the photographs, as papers print it (`psnr_mean`), and pooled (`psnr`); LPIPS is AlexNet's.
@@ -91,14 +92,17 @@ def measure_photographs(setup: Setup, name: str, cases: Sequence[Case]) -> Itera
             ply = data_set.path_of(case.name, ".ply")
             report = json.loads(data_set.path_of(case.name, ".json").read_text())
             return {"by": "train", **report, "ply_bytes": ply.stat().st_size, **_scores(read_ply(ply), data, lpips)}
-        if case["of"] in trainings:
+        if case.get("of") in trainings:
             ensure_trained(case["of"])
         file = data_set.path_of(case.name, ".csplat")
         values = (
             _by_command(setup, data_set, case, file) if "command" in case.settings else _finish(data_set, case, file)
         )
         series = f"csplat {values['by']}{', without ' + case['without'] if 'without' in case.settings else ''}"
-        return {"training": case["of"], "series": series, **values, **_scores(decode(file.read_bytes()), data, lpips)}
+        model = decode(file.read_bytes())
+        record = model.metadata.training
+        size = None if record is None or record.size is None else "{}×{}".format(*record.size)
+        return {"training": case.get("of"), "series": series, "images": size, **values, **_scores(model, data, lpips)}
 
     yield measure
 
@@ -167,10 +171,13 @@ def finish_training(
 
 
 def _by_command(setup: Setup, data_set: _Set, case: Case, file: Path) -> dict[str, Any]:
-    ply = data_set.path_of(case["of"], ".ply")
+    ply = data_set.path_of(case.get("of", case.name), ".ply")
     words = [argument.format(ply=ply, file=file, data=data_set.path) for argument in shlex.split(case["command"])]
     used = run_program([*setup.csplat, *words, "--force", "--quiet", "--json"])
-    return {"by": words[0], **_describe(json.loads(used.stdout), used.wall, file)}
+    report = json.loads(used.stdout)
+    options = report["training"]["options"] if "training" in report else {}
+    planned = {name: options.get(name) for name in ("max_splats", "iterations")}
+    return {"by": words[0], **planned, **_describe(report.get("file", report), used.wall, file)}
 
 
 def _describe(report: Mapping[str, Any], seconds: float, file: Path) -> dict[str, Any]:

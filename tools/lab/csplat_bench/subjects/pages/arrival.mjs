@@ -43,7 +43,7 @@ export function begin(viewer, url, camera) {
 async function show(viewer, canvas, url, camera) {
   const page = await import(`/pages/${viewer}.mjs`);
   version = page.version;
-  await (await page.show(canvas, url, camera, { progressive: true })).whole;
+  await (await page.show(canvas, url, camera, { progressive: true, levels: true })).whole;
   whole = true;
 }
 

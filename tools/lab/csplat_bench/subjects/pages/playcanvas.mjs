@@ -24,6 +24,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
   const parser = new CsplatParser(app);
   app.loader.getHandler('gsplat').addParser(parser);
   app.start();
+  app.scene.gsplat.lodUnderfillLimit = 10; // streamed SOG is drawn coarsely until finer levels are here
   const eye = new pc.Entity();
   eye.addComponent('camera', { clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE });
   app.root.addChild(eye);

@@ -1,17 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-// Offers to save the up direction that the user chose: as a rewritten file, or with a command.
+// Offers to save the up direction or the first view that the user chose: as a rewritten file, or with a command.
 
 import { element, saveFile } from './overlay.mjs';
 
 /**
  * @typedef {import('./vectors.mjs').Vec3} Vec3
+ * @typedef {import('./types.d.ts').FileCamera} FileCamera
+ * @typedef {import('./types.d.ts').MetadataChanges} MetadataChanges
  * @typedef {object} Hooks
- * @property {(up: Vec3) => Promise<Uint8Array<ArrayBuffer>>} file returns the scene's file with this up direction
+ * @property {(changes: MetadataChanges) => Promise<Uint8Array<ArrayBuffer>>} file returns the scene's file with these changes
  * @property {(text: string) => void} say shows a message briefly
  */
 
 const DIGITS = 1e6; // a precision of a millionth of a radian
 const AXES = ['x', 'y', 'z'];
+const VIEW_DIGITS = 7; // significant ones of a camera's numbers
+const VIEW_FILE = 'view.json'; // file of the camera in the command
 
 /**
  * Round a direction as stored in files.
@@ -35,40 +39,61 @@ export function upWord(up) {
 }
 
 /**
- * Return the command that encodes the file again with an up direction.
+ * Round the numbers of a camera as stored in files.
+ *
+ * @param {FileCamera} camera
+ * @returns {FileCamera}
+ */
+export function roundedCamera(camera) {
+  const round = (/** @type {number} */ value) => Number(value.toPrecision(VIEW_DIGITS)) + 0;
+  const { K, viewmat, W, H, near } = camera;
+  return {
+    K: K.map((row) => row.map(round)),
+    viewmat: viewmat.map((row) => row.map(round)),
+    W,
+    H,
+    ...(near && { near: round(near) }),
+  };
+}
+
+/**
+ * Return the command that encodes the file again with an up direction, a first view, or both.
  *
  * @param {string} name name of the file
- * @param {Vec3} up
+ * @param {MetadataChanges} changes
  */
-export function saveUpCommand(name, up) {
+export function saveCommand(name, { up, view }) {
   const stem = name.replace(/\.csplat$/i, '') || 'scene';
   const words = [`${stem}.ply`, `${stem}.csplat`].map((word) =>
     /^[\w.+-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`,
   );
-  return `csplat encode ${words.join(' ')} --up ${upWord(up)}`;
+  return `csplat encode ${words.join(' ')}${view ? ` --cameras ${VIEW_FILE}` : ''}${up ? ` --up ${upWord(up)}` : ''}`;
 }
 
-export class SaveUpOffer {
+export class SaveOffer {
   /** @param {Hooks} hooks */
   constructor(hooks) {
     this.hooks = hooks;
     this.name = '';
-    /** @type {Vec3} */
-    this.up = [0, 0, 1];
+    /** @type {MetadataChanges} */
+    this.changes = {};
     element('keep-copy', HTMLElement).addEventListener('click', () => void this.#copy());
+    element('keep-camera', HTMLElement).addEventListener('click', () => this.#saveCamera());
     element('keep-download', HTMLElement).addEventListener('click', () => void this.#download());
     element('keep-close', HTMLElement).addEventListener('click', () => this.hide());
   }
 
   /**
    * @param {string} name name of the file
-   * @param {Vec3} up
+   * @param {MetadataChanges} changes
    */
-  show(name, up) {
+  show(name, { up, view }) {
     this.name = name;
-    this.up = rounded(up);
-    element('keep-title', HTMLElement).textContent = `${upWord(up).replace('-', '−')} is up.`;
-    element('keep-command', HTMLElement).textContent = saveUpCommand(name, up);
+    this.changes = { ...(up && { up: rounded(up) }), ...(view && { view: roundedCamera(view) }) };
+    const isUp = up ? `${upWord(up).replace('-', '−')} is up.` : '';
+    element('keep-title', HTMLElement).textContent = view ? `The first view is this one. ${isUp}`.trim() : isUp;
+    element('keep-command', HTMLElement).textContent = saveCommand(name, this.changes);
+    element('keep-camera', HTMLElement).hidden = !view;
     element('keep', HTMLElement).hidden = false;
   }
 
@@ -87,12 +112,17 @@ export class SaveUpOffer {
     this.hooks.say('Copied');
   }
 
+  /** Save the camera for `--cameras`. */
+  #saveCamera() {
+    saveFile(JSON.stringify([this.changes.view]), VIEW_FILE, 'application/json');
+  }
+
   async #download() {
     const button = element('keep-download', HTMLButtonElement);
-    const { name, up } = this;
+    const { name, changes } = this;
     button.disabled = true;
     try {
-      saveFile(await this.hooks.file(up), name || 'scene.csplat', 'model/vnd.csplat');
+      saveFile(await this.hooks.file(changes), name || 'scene.csplat', 'model/vnd.csplat');
     } catch (error) {
       this.hooks.say(`The file could not be written: ${error instanceof Error ? error.message : error}`);
     } finally {
