@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The encoder: files that csplat-decoder reads, errors, progress, workers. That its files equal those of the encoder in C, whose
-// tests compare them with Python's, is tested by tests/system/test_js_encoder.py.
+// The encoder: files that csplat-decoder reads, errors, progress, workers. Also: tasks. That its files equal those of the encoder
+// in C, whose tests compare them with Python's, is tested by tests/system/test_js_encoder.py.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
