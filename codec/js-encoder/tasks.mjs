@@ -262,6 +262,7 @@ export const TASKS = {
     });
     instance.readPly(ply);
     share = 1;
-    return instance.encode(undefined);
+    const [splatCount, rowCount] = [instance.fields[FIELDS.count], instance.fields[FIELDS.rowCount]];
+    return { file: instance.encode(undefined), splatCount, rowCount };
   },
 };
