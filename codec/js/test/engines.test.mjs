@@ -201,7 +201,13 @@ const TARGET = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
 
 test('tiles have the axes of an engine that asks for them, if signs suffice', () => {
   const of = (axes, metadata) =>
-    new SplatScene({ header: { axes, tiles: [], splatCount: 0 } }, [], { metadata, cameras: null }, {}, { ...TARGET, aligns: true });
+    new SplatScene(
+      { header: { axes, tiles: [], splatCount: 0 } },
+      [],
+      { metadata, cameras: null },
+      {},
+      { ...TARGET, aligns: true },
+    );
   const turned = (axes, metadata = null) => of(axes, metadata).upright.map((row) => row.map((value) => value + 0));
   const unit = [0, 1, 2].map((k) => [0, 1, 2].map((i) => (i === k ? 1 : 0)));
   for (const [axes, signs] of Object.entries({
