@@ -64,6 +64,8 @@ class SceneMetadata:
             Properties return their values if these are valid.
         semantics: what extra columns mean, by the column's name: `label`, `object_id`, `normal`, `feature:` and the
             name of a model, and so on (registry of semantics, spec 12).
+        quantised: the values come from a file of one byte each (SPZ, SOG), so that many of them are equal. It says how
+            to encode a scene, is not written to files, and does not count in comparisons.
 
     Raises:
         InputError: the coordinate system, the unit or the colour space is invalid.
@@ -77,6 +79,7 @@ class SceneMetadata:
     cameras: Sequence[Mapping[str, Any]] | None = None
     entries: Mapping[str, Any] = field(default_factory=dict)
     semantics: Mapping[str, str] = field(default_factory=dict)
+    quantised: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.coordinate_system != UNSPECIFIED:

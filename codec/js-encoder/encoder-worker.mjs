@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The code that runs in a worker; encoder.mjs runs in the calling thread. A worker does one task.
 
-import { CsplatError, TASKS } from './encoder.mjs';
+import { CsplatError, TASKS } from './tasks.mjs';
 
 /** @param {any} port source of the request and target of the answers */
 function serve(port) {

@@ -64,5 +64,13 @@ export function encode(splats: Splats, options?: EncodeOptions): Promise<Uint8Ar
  */
 export function readPly(ply: ArrayBuffer | Uint8Array, options?: EncodeOptions): Promise<PlySplats>;
 
+/** A PLY that is encoded. */
+export interface EncodedPly {
+  file: Uint8Array<ArrayBuffer>;
+  splatCount: number;
+  /** Rows of the PLY; those with NaN or infinity, `rowCount - splatCount`, are left out. */
+  rowCount: number;
+}
+
 /** Read and encode a PLY, which takes half the memory of both calls. Throws a CsplatError. */
-export function encodePly(ply: ArrayBuffer | Uint8Array, options?: EncodeOptions): Promise<Uint8Array<ArrayBuffer>>;
+export function encodePly(ply: ArrayBuffer | Uint8Array, options?: EncodeOptions): Promise<EncodedPly>;

@@ -21,7 +21,7 @@ from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.encode_file import encode_file
 from csplat_tools.importance_file import encoder_importance
-from csplat_tools.scene_files import load_scene
+from csplat_tools.scene_files import load_scene, with_first_view
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
@@ -63,7 +63,7 @@ def test_fewer_bands_are_projected_if_the_renderer_is_installed(sample_path, tmp
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     projected = encode_file(load_scene(model), str(tmp_path / "projected.csplat"), options).result
     assert "projected onto the others, for the directions of " in projected.report.notes[-1]
-    cut = csplat.encode(model, options)
+    cut = csplat.encode(with_first_view(load_scene(model)).model(), options)
     assert scorer.psnr(csplat.decode(cut)) + 0.5 < scorer.psnr(csplat.decode(projected.data))
     bounded = encode_file(load_scene(model), str(tmp_path / "bounded.csplat"), options, context=Context(memory=10**9))
     assert "bands are cut off: " in bounded.result.report.notes[-1]

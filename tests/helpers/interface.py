@@ -44,7 +44,6 @@ INTERNAL = {
     "EncodeOptions": "chosen kept_degree",
     "EncodeResult": "content rows with_notes with_search",
     "FinetuneOptions": "has_calmed scaled",
-    "Outputs": "preview_due",
     "Scene": "changed empty has_doubles in_memory keep_open like loaded modified_ns numbered of reader with_progress",
     "SceneMetadata": "stated_up",
     "SimplifyOptions": "pruner views_and_size work",

@@ -26,6 +26,27 @@ from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
 
 pytestmark = [pytest.mark.slow, pytest.mark.engines]
+# Loads files by three.js's own loader of SPZ and by ours: what a program can see of the geometries.
+GEOMETRIES = """async ([spz, csplat]) => {
+  const { SPZLoader } = await import('three/addons/loaders/SPZLoader.js');
+  const { CSPLATLoader } = await import('csplat-decoder/three');
+  const seen = [];
+  for (const [loader, url] of [[new SPZLoader(), spz], [new CSPLATLoader(), csplat]]) {
+    const geometry = await loader.loadAsync(url);
+    const attributes = Object.entries(geometry.attributes);
+    const { min, max } = geometry.boundingBox;
+    seen.push({
+      type: geometry.constructor.name,
+      keys: Object.keys(geometry).filter((key) => key !== '_listeners'), // ours listens for its disposal
+      kinds: attributes.map(([name, { constructor, array, itemSize, normalized, count, usage, gpuType }]) =>
+        [name, constructor.name, array.constructor.name, itemSize, normalized, count, usage, gpuType]),
+      bounds: [min, max, geometry.boundingSphere.center].map((place) => place.toArray()),
+      values: attributes.map(([, { array, itemSize }]) =>
+        Array.from(array instanceof Uint32Array ? new Uint8Array(array.buffer) : array)),
+    });
+  }
+  return seen;
+}"""
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")
 
@@ -196,6 +217,29 @@ def test_levels_follow_the_camera(trial, files, coarser):
     assert [] == failed
     if trial.engine != "three":  # it keeps its textures, of a PLY, too
         assert trial.memory()[1] <= before + 100_000
+
+
+def test_three_js_gets_the_geometry_that_its_own_loader_makes_of_spz(browser, files):
+    folder, address, model, _ = files
+    write(folder / "scene.spz", model)
+    with started(browser, files, "three") as stage:
+        own, ours = stage.page.evaluate(GEOMETRIES, [f"{address}scene.spz", f"{address}scene.csplat"])
+        left = stage.page.evaluate(GEOMETRIES, [f"{address}scene.spz", f"{address}left.csplat"])[1]
+    for key in ("type", "keys", "kinds"):
+        assert own[key] == ours[key] == left[key]
+    np.testing.assert_allclose(own["bounds"], ours["bounds"], atol=2**-12)
+    np.testing.assert_allclose(left["bounds"], ours["bounds"], atol=1e-3)
+    # SPZ rounds positions to 1/4096, logarithms of scales to 1/16, rotations to 10 bits, and SH to 5 and 4 bits.
+    names = [kind[0] for kind in ours["kinds"]]
+    pairs = {name: (np.array(a), np.array(b)) for name, a, b in zip(names, own["values"], ours["values"], strict=True)}
+    np.testing.assert_allclose(*pairs.pop("position"), atol=2**-12)
+    a, b = (values.reshape(-1, 6) for values in pairs.pop("covariance"))
+    assert (np.abs(a - b) <= 0.1 * b[:, [0, 3, 5]].sum(axis=1, keepdims=True) + 1e-9).all()
+    assert np.abs(np.subtract(*pairs.pop("color"))).max() <= 2
+    assert ["sphericalHarmonics1", "sphericalHarmonics2", "sphericalHarmonics3"] == list(pairs)
+    for a, b in pairs.values():
+        assert np.abs(a - b).max() <= 9
+        assert np.corrcoef(a, b)[0, 1] > 0.8
 
 
 @pytest.mark.parametrize("engine", ["playcanvas", "babylon"])

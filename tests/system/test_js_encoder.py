@@ -27,7 +27,7 @@ DROP = """([text]) => {
 ENCODE = """
 import { readFileSync, writeFileSync } from 'node:fs';
 import { encodePly } from '%s';
-writeFileSync(process.argv[2], await encodePly(readFileSync(process.argv[1])));
+writeFileSync(process.argv[2], (await encodePly(readFileSync(process.argv[1]))).file);
 """
 
 
@@ -79,8 +79,12 @@ def test_the_page_converts_a_chosen_or_dropped_file_and_sends_nothing(tab, site,
     download.value.save_as(tmp_path / "saved.csplat")
     assert len(csplat.read(SAMPLE)) == len(csplat.decode((tmp_path / "saved.csplat").read_bytes()))
 
-    page.evaluate(DROP, [base64.b64encode(SAMPLE.read_bytes()).decode()])
+    assert page.inner_text("#status").endswith(" MB.")
+
+    broken = SAMPLE.read_bytes()[:-4] + np.float32(np.nan).tobytes()
+    page.evaluate(DROP, [base64.b64encode(broken).decode()])
     tab.until("document.getElementById('link').textContent === 'Save dropped.csplat'")
+    assert f" 1 of {len(csplat.read(SAMPLE)):,} splats are left out" in page.inner_text("#status")
     page.evaluate(DROP, [base64.b64encode(b"no PLY\n").decode()])
     tab.until("document.getElementById('problem').textContent !== ''")
     assert "dropped.ply: the file is no PLY" == page.inner_text("#problem")

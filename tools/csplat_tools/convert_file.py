@@ -16,6 +16,7 @@ import csplat
 from csplat.decoder import Limits
 from csplat.disk_files import resolve_links, size_on_disk
 from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene, scale_scene, translate_scene
+from csplat.encoder import PresetName
 from csplat.errors import InputError
 from csplat.formats import format_by_name, format_by_suffix, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
@@ -284,6 +285,7 @@ def convert_file(
     filters: Filters | None = None,
     no_loss: bool = False,
     dry_run: bool = False,
+    preset: PresetName = "balanced",
     progress: Progress | None = None,
 ) -> Conversion:
     """Read a scene in one format and write it in another, block by block.
@@ -301,6 +303,7 @@ def convert_file(
             format, if these are fixed, although the scene is read along others.
         no_loss: refuse if anything would be lost.
         dry_run: write nothing.
+        preset: precision of formats that have several, which is SPZ.
         progress: progress callback; some formats read splats twice.
 
     Raises:
@@ -308,7 +311,7 @@ def convert_file(
         OSError: a file cannot be read or written.
     """
     path = Path(target)
-    writes = format_by_suffix(path) if write_as is None else format_by_name(write_as)
+    writes = (format_by_suffix(path) if write_as is None else format_by_name(write_as)).at(preset)
     if writes.write is None:
         raise InputError(f"{target} has the name of {writes.title}, which csplat does not write")
     if writes.takes_levels(path) and resolve_links(path.parent) in (
@@ -351,9 +354,9 @@ def convert_file(
             for at, changed in enumerate(levels)
         ]
         if dry_run:
-            losses = survey_losses(reporting, writes.name)
+            losses = survey_losses(reporting, writes.name, preset)
         else:
-            losses = write_levels(path, reporting, writes.name)
+            losses = write_levels(path, reporting, writes.name, preset)
             result = replace(result, size_bytes=size_on_disk(path))
         result = replace(result, losses=tuple(finding for finding in losses if finding.id != "lost-contents"))
         findings = tuple(finding for finding in reader.findings if not (more and finding.id == "levels"))

@@ -444,7 +444,7 @@ def image_row(images: Mapping[str, U8], name: str) -> str:
     for word, pixels in images.items():
         small = _reduced(pixels)
         figures += (
-            f'<figure><img src="{_data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
+            f'<figure><img src="{data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
             f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
         )
     return f'<div class="pictures">{figures}</div>'
@@ -474,7 +474,7 @@ def _framed(image: F32, rows: slice, columns: slice) -> U8:
     return shown
 
 
-def _data_uri(pixels: U8) -> str:
+def data_uri(pixels: U8) -> str:
     """Return an image [H, W, 3] as a data URI for an `img` element: WebP, or PNG if pillow was built without it."""
     from PIL import Image, features
 

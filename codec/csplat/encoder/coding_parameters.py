@@ -18,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.encoder.encode_options import PRESETS, EncodeOptions
+from csplat.encoder.encode_options import PRESETS, QUANTISED_PRESETS, EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
 from csplat.model import SplatModel
 from csplat.portable_math import ceil_log2, exp, log
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
+
+#: Largest displacement of a mean by rounding, in steps.
+HALF_DIAGONAL = 3.0**0.5 / 2.0
 
 _EXTENT_SAMPLE = 1 << 16  # splats on which the extent is estimated
 _EDGE = 0.02  # fraction of the splats outside the extent on either side of an axis
@@ -31,7 +34,6 @@ _BITS_MAX = 16  # bits per axis of a tile
 _STEP_MIN = 1e-250  # scene units
 _GRID_TRIAL = 1024  # splats to test first, which most scenes that are not on a grid fail
 _GRID_MIN = 0.8  # smallest step of a source's grid that is adopted, as a multiple of the chosen step
-_HALF_DIAGONAL = 3.0**0.5 / 2.0  # largest displacement of a mean by rounding, in steps
 _STATISTICS_SAMPLE = 1 << 16  # splats
 _RUNS = 16  # runs of neighbours in the sample
 _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
@@ -105,6 +107,8 @@ class CodingParameters:
         deflate: level and library of DEFLATE.
         canonical: keep the axis order of shapes, which was canonical before tuning; the file then contains the integers
             that tuning was based on, even if a shape crossed the boundary of canonical order.
+        sorts_axes: sort the axes of shapes by scale; otherwise the rotations of a quantised source stay on its lattice.
+        square_opacities: levels are equidistant in the square root of alpha, otherwise in alpha.
     """
 
     lattice: Lattice
@@ -126,6 +130,8 @@ class CodingParameters:
     tile_splats: int
     deflate: DeflateSettings
     canonical: bool = False
+    sorts_axes: bool = True
+    square_opacities: bool = True
 
     def __post_init__(self) -> None:
         for name in ("scale_step", "sh0_step", "sh_step", "codebook_step"):  # ATT-10: "a binary32 value"
@@ -141,8 +147,9 @@ class CodingParameters:
         lattice, ycocg = _spec.MAPPING_LATTICE, _spec.MAPPING_YCOCG
         levels = self.opacity_levels, self.quat_levels
         shift = self.chroma_shift
+        opacities = _spec.MAPPING_SQUARE if self.square_opacities else _spec.MAPPING_LINEAR
         records = [
-            _spec.AttributeRecord(_spec.ATTRIBUTE_OPACITIES, _spec.MAPPING_SQUARE, 0, 0, levels[0], 0.0),
+            _spec.AttributeRecord(_spec.ATTRIBUTE_OPACITIES, opacities, 0, 0, levels[0], 0.0),
             _spec.AttributeRecord(_spec.ATTRIBUTE_SCALES, lattice, 0, 0, 0, self.scale_step),
             _spec.AttributeRecord(_spec.ATTRIBUTE_QUATS, _spec.MAPPING_UNIT_W, 0, 0, levels[1], 0.0),
             _spec.AttributeRecord(_spec.ATTRIBUTE_MEANS, lattice, 0, 0, 0, self.lattice.step),
@@ -165,7 +172,7 @@ def choose_parameters(
         importance_given: the caller specifies the importance of the splats.
         contrast: contrast of the scene that the model is a sample of; see `contrast_of`.
     """
-    preset = PRESETS[options.preset]
+    preset = (QUANTISED_PRESETS if model.metadata.quantised else PRESETS)[options.preset]
     degree = options.kept_degree(model.sh_degree)
     if options.sh_coding == "none":
         degree = 0
@@ -306,7 +313,7 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> La
         by_quality: step that the quality chooses, scene units; 0 if the scene has no extent.
     """
     if options.position_error is not None:
-        return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, error=options.position_error)
+        return Lattice(options.position_error / HALF_DIAGONAL, _BITS_MAX, error=options.position_error)
     if options.position_step is not None:
         return Lattice(options.position_step, _BITS_MAX)
     if len(model) == 0:
@@ -337,14 +344,14 @@ def _source_step(values: F32, step: float) -> float:
     if not (step > _STEP_MIN and values.any()):
         return step
     grid = math.ldexp(1.0, ceil_log2(_GRID_MIN * step))
-    if not (_on_grid(values[:_GRID_TRIAL], grid) and _on_grid(values, grid)):
+    if not (on_grid(values[:_GRID_TRIAL], grid) and on_grid(values, grid)):
         return step
-    while _on_grid(values, 2.0 * grid):
+    while on_grid(values, 2.0 * grid):
         grid *= 2.0
     return grid
 
 
-def _on_grid(values: F32, grid: float) -> bool:
+def on_grid(values: F32, grid: float) -> bool:
     """Return True if every value is a multiple of `grid`; an infinite value is on no grid."""
     with np.errstate(over="ignore", invalid="ignore"):
         return not np.fmod(values, np.float32(grid)).any()

@@ -29,6 +29,7 @@ from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
 from csplat.encoder.sh_codebook import FileCodebooks, choose_sh_coding, final_parameters
 from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantise_shapes
+from csplat.encoder.source_lattices import keep_lattices
 from csplat.encoder.splat_importance import (
     Importance,
     get_blocks,
@@ -137,6 +138,7 @@ class EncodePlan:
         if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
             return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats, context), options, origin, context)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
+        parameters = keep_lattices(model, parameters, options)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
         parameters, classes = choose_classes(model, blocks, parameters, options)

@@ -16,6 +16,7 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan
 from csplat.encoder.pipeline import EncodeResult, encode_tiles
+from csplat.encoder.source_lattices import exact_options
 from csplat.encoder.splat_importance import Importance
 from csplat.encoder.target import SearchReport, Target
 from csplat.errors import InputError
@@ -31,6 +32,7 @@ _SCALE_STEP_RATIO = 0.4  # first scale step, log scale, relative to the bound of
 _QUAT_LEVELS_RATIO = 4.0  # first rotation levels, times that bound
 _QUAT_LEVELS_MIN = 8  # smallest number of rotation levels that the search tries
 _STEP_MIN, _STEP_MAX = 1e-6, 1e3  # range of the steps that `EncodeOptions` accepts
+_ROUNDING = 2.0**-19  # largest error if a bound is 0: of float32, in the source's program and in decoders
 _KNOBS = {  # options that set the steps of a family of measures
     "means": ("position_error", "position_step", "position_bits"),
     "covariance": ("scale_step", "quat_levels", "shape_codebook_size"),
@@ -68,17 +70,21 @@ def meet_bounds(
     tried = dict[EncodeOptions, dict[str, float]]()  # largest errors relative to their bounds
     # By family of measures: log of the bounds that steps are chosen for, relative to `bounds`; and for each such value
     # the log of the largest error relative to its bound.
-    coarseness = {_family(name): 0.0 for name in bounds}
+    exact = {_family(name) for name, bound in bounds.items() if bound == 0.0}
+    coarseness = {_family(name): 0.0 for name in bounds if _family(name) not in exact}
     measured = {family: dict[float, float]() for family in coarseness}
     best: tuple[EncodeResult, EncodeOptions] | None = None
     while True:
         options = _options_for(
-            source, encoding, {name: bound * math.exp(coarseness[_family(name)]) for name, bound in bounds.items()}
+            source,
+            encoding,
+            {name: bound * math.exp(coarseness.get(_family(name), 0.0)) for name, bound in bounds.items()},
+            exact,
         )
         if options not in tried:
             plan = EncodePlan.of(source, options, importance=importance, context=context)
             result = encode_tiles(plan).write()
-            tried[options] = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
+            tried[options] = {name: result.largest_error(name) / (bound or _ROUNDING) for name, bound in bounds.items()}
             is_met = max(tried[options].values()) <= 1.0
             if is_met and (best is None or result.size_bytes < best[0].size_bytes):
                 best = result, options
@@ -101,7 +107,7 @@ def meet_bounds(
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
             f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best found is"
-            f" {ratios[worst] * bounds[worst]:.3g}; allow a larger error"
+            f" {ratios[worst] * (bounds[worst] or _ROUNDING):.3g}; allow a larger error"
         )
     result, options = best
     search = SearchReport(
@@ -116,23 +122,29 @@ def meet_bounds(
     return result.with_search(search), options
 
 
-def _options_for(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
+def _options_for(
+    source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float], exact: set[str]
+) -> EncodeOptions:
     """Return the options with steps that should keep the errors within bounds; encoding shows if they do.
 
     Args:
         source: the scene.
         encoding: the caller's options.
-        bounds: largest error by measure, > 0.
+        bounds: largest error by measure, >= 0.
+        exact: families of measures of which a bound is 0: their attributes keep the source's values.
 
     Raises:
-        InputError: `encoding` sets an option that a bound determines, or drops or excludes bounded SH bands.
+        InputError: `encoding` sets an option that a bound determines, or drops or excludes bounded SH bands; or the
+            source has values on no lattice, of which a bound is 0.
     """
-    chosen: dict[str, Any] = {}
+    chosen: dict[str, Any] = exact_options(source, exact)
     for name, bound in bounds.items():
         knobs = _KNOBS[_family(name)]
         already_set = [knob for knob in knobs if getattr(encoding, knob) is not None]
         if already_set:
             raise InputError(f"{already_set[0]} is determined by the largest error of {name}: give only one of them")
+        if _family(name) in exact:
+            continue
         if name == "means":
             chosen["position_error"] = bound
         elif name == "opacities":

@@ -291,7 +291,7 @@ def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> Fixe
     sh_plan = codebooks.sh_plan
     if sh_plan.of_sample:
         sh_plan = assign_splats(sh_plan, plan.model, plan.parameters, plan.context)
-    parameters = replace(plan.parameters, canonical=True)
+    parameters = replace(plan.parameters, canonical=True, square_opacities=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
     plan = replace(_reorder(plan, order, [len(part) for part in rows]), parameters=parameters)

@@ -388,9 +388,11 @@ class _TileResult:
     def add_opacities(self, opacities: F32) -> None:
         """Add the alphas [n]."""
         levels = self.parameters.opacity_levels
-        q = opacity_levels(opacities, levels, square=True, multiple=self.factors.opacities)
+        q = opacity_levels(opacities, levels, square=self.parameters.square_opacities, multiple=self.factors.opacities)
         self.blocks.append(entropy.levels_block(q, self.parameters.deflate))
-        self.add_errors("opacities", value_errors(opacities, opacity_values(q, levels, square=True)))
+        self.add_errors(
+            "opacities", value_errors(opacities, opacity_values(q, levels, square=self.parameters.square_opacities))
+        )
 
     def add_shapes(self, quats: F32, scales: F32, part: ShapePart | None) -> float:
         """Add scales and rotations; return the largest decoded log scale."""

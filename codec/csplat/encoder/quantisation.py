@@ -28,6 +28,9 @@ _EXACT32 = 2.0**20  # steps from which colours are quantised in float64
 _ROWS = 2048  # splats per block; rows of 45 floats and their columns fit the second-level cache
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # spec 7.5
 
+#: Largest distance from a lattice point, in steps, of values that were computed from its integer in float32.
+LATTICE_TOLERANCE = 0.00025
+
 Quaternion = tuple[F32, F32, F32, F32]
 
 
@@ -150,7 +153,10 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
     kind = np.int64 if wide else np.int32
     real = r.dtype.type
     co = _round_multiples((r - b) * real(0.5**shift), kind, coarse)
-    cg = _round_multiples((g - (r + b) * real(0.5)) * real(0.5**shift), kind, coarse)
+    if shift or coarse is not None:
+        cg = _round_multiples((g - (r + b) * real(0.5)) * real(0.5**shift), kind, coarse)
+    else:  # halves are rounded up, which reproduces integers exactly (encoders.md, E.2)
+        cg = np.floor(g - (r + b) * real(0.5) + real(0.5)).astype(kind)
     full_co, full_cg = co << shift, cg << shift
     luma = r + g + b
     luma -= full_cg + full_co - 2 * (full_co >> 1)
@@ -262,12 +268,27 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
             b, c = high, low
             turned = (-(y + z), y - z, w - x, w + x)
         w, x, y, z = _exchange_axes(swap, turned, (w, x, y, z))
-    w, x, y, z = _largest_component_first(w, x, y, z)
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    np.copysign(length, w, out=length)
-    rotation = np.stack([w, x, y, z])
-    rotation /= length
-    return rotation, np.stack([a, b, c])
+    return _rotation_led_by((np.abs(w), np.abs(x), np.abs(y), np.abs(z)), (w, x, y, z)), np.stack([a, b, c])
+
+
+def rotation_on_lattice(quats: F32, levels: int) -> F32:
+    """Return rotations of a quantised source whose x, y and z are multiples of √½ / levels, if it has such.
+
+    SPZ and SOG store three components as such multiples. The fourth follows from their length, and may be smaller than
+    one of them. The axes keep their order.
+
+    Args:
+        quats: [n, 4] float32, w x y z, unit length within 1e-3.
+        levels: M.
+
+    Returns:
+        [4, n] float32, unit length, w >= 0: of four equal rotations, the one whose w is on no lattice point or, if all
+        components are on one, the largest.
+    """
+    columns = np.ascontiguousarray(quats.T)
+    scaled = np.abs(columns) * np.float32(levels * _ROOT2)
+    keys = np.abs(columns) + np.float32(2) * (np.abs(scaled - np.rint(scaled)) > LATTICE_TOLERANCE)
+    return _rotation_led_by((keys[0], keys[1], keys[2], keys[3]), (columns[0], columns[1], columns[2], columns[3]))
 
 
 def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion) -> Quaternion:
@@ -277,17 +298,24 @@ def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion
     return w, x, y, z
 
 
-def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Quaternion:
-    """Multiply quaternions, [N] per component, from the right by 1, i, j or k so that w has the largest magnitude.
+def _rotation_led_by(keys: Quaternion, quat: Quaternion) -> F32:
+    """Multiply quaternions, [N] per component, from the right by 1, i, j or k so that w is the one of the largest key.
 
-    Of equal magnitudes, w is preferred, then z, then y. The new w may be negative.
+    Of equal keys, that of w is preferred, then z, then y.
+
+    Returns:
+        [4, N], unit length, w >= 0.
     """
-    aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
+    (aw, ax, ay, az), (w, x, y, z) = keys, quat
     x_leads = ax > np.maximum(aw, np.maximum(ay, az))
     y_leads = ~x_leads & (ay > np.maximum(aw, az))
     z_leads = ~x_leads & ~y_leads & (az > aw)
-    flat = np.where(x_leads, -x, np.where(y_leads, -y, np.where(z_leads, -z, w)))
+    new_w = np.where(x_leads, -x, np.where(y_leads, -y, np.where(z_leads, -z, w)))
     new_x = np.where(x_leads, w, np.where(y_leads, -z, np.where(z_leads, y, x)))
     new_y = np.where(x_leads, z, np.where(y_leads, w, np.where(z_leads, -x, y)))
     new_z = np.where(x_leads, -y, np.where(y_leads, x, np.where(z_leads, w, z)))
-    return flat, new_x, new_y, new_z
+    length = np.sqrt(new_w * new_w + new_x * new_x + new_y * new_y + new_z * new_z)
+    np.copysign(length, new_w, out=length)
+    rotation = np.stack([new_w, new_x, new_y, new_z])
+    rotation /= length
+    return rotation

@@ -28,7 +28,7 @@ from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.portable_math import log2
-from csplat.types import F32, F64, I16, I32, U32
+from csplat.types import F32, F64, I16, I32, I64, U32
 
 Rows = NDArray[np.intp]
 
@@ -47,6 +47,7 @@ _IMPORTANT = 0.95  # quantile of the weights above which splats are quantised on
 _CLEAR = 0.2  # relative difference of rates that no DEFLATE level reverses; rates of trials are up to 13 % too high
 _COARSEST = 6  # log2 of the coarsest multiple of the SH step
 _SLACK = 1.0 + 2.0**-18  # factor that covers the rounding of float32 differences in declared errors
+_DISTINCT_PER_ENTRY = 8  # distinct SH of a quantised source per entry; more entries cost more than coarser steps save
 _ENTRY_BITS_MIN = 4  # log2 of the smallest number of entries that is chosen
 _CODEBOOK_ID = 0
 
@@ -204,7 +205,13 @@ def choose_sh_coding(
     size = _codebook_size(len(model), fine, options)
     step = max(1, len(model) // max(_TRAINING_SPLATS, _TRAINING_USERS * size)) if is_sample else 1
     rule, index, distortion = _train(
-        model.shN[::step], replace(error_weights, weights=weights[::step]), size, fine, options, context
+        model.shN[::step],
+        replace(error_weights, weights=weights[::step]),
+        size,
+        fine,
+        options,
+        context,
+        quantised=model.metadata.quantised,
     )
     rgb = rule.entries.reshape(len(rule.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
     book = ShCodebook(colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift), index)
@@ -418,6 +425,8 @@ def _train(
     parameters: CodingParameters,
     options: EncodeOptions,
     context: Context,
+    *,
+    quantised: bool,
 ) -> tuple[AssignmentRule, I32, float]:
     """Train a codebook, and escape the splats that it represents worst.
 
@@ -426,8 +435,9 @@ def _train(
         error_weights: weights of the errors of these splats.
         size: maximum number of entries.
         parameters: step, kept bands, and fraction to escape.
-        options: `escape_fraction`, if the caller set it.
+        options: `codebook_size` and `escape_fraction`, if the caller set them.
         context: threads, seed and progress.
+        quantised: many splats have equal SH, of which each is clustered once, with the weight of all.
 
     Returns:
         The entries by frequency, with the rule for other splats; [N] entry of each splat, the number of entries for an
@@ -435,11 +445,21 @@ def _train(
     """
     weights = error_weights.weights
     points = _lattice_points(shN, parameters, context)
+    distinct = _distinct_rows(points) if quantised else None
+    if distinct is not None and options.codebook_size is None:
+        share = max(1.0, len(distinct[0]) / _DISTINCT_PER_ENTRY)
+        size = min(size, 1 << max(round(float(log2(share))), _ENTRY_BITS_MIN))
     effort = {}
     if size >= _GROUPED_ENTRIES_MIN:
         effort = {"near_groups": _NEAR_GROUPS, "iterations": _ITERATIONS, "sample_per_entry": _SAMPLE_PER_ENTRY}
 
-    clustered = cluster(points, weights, size, context=context, **effort)
+    if distinct is None:
+        clustered = cluster(points, weights, size, context=context, **effort)
+    else:
+        rows, inverse = distinct
+        summed = np.bincount(inverse, weights).astype(np.float32)
+        found, index_of_distinct = cluster(points[rows], summed, size, context=context, **effort)
+        clustered = found, index_of_distinct[inverse]
     if error_weights.metric is not None:
         clustered = _refine(shN, points, error_weights.metric, clustered, parameters, context)
     ranked, entries = rank_by_frequency(clustered[1], clustered[0])
@@ -489,6 +509,20 @@ def _lattice_points(shN: F32, parameters: CodingParameters, context: Context) ->
 
     run_blocks(work, len(shN), _BLOCK, context)
     return points
+
+
+def _distinct_rows(points: I16) -> tuple[Rows, Rows]:
+    """Return the row of the first of each distinct point, and for each point [N] the number of that row.
+
+    Points [N, D] are told apart by a random linear function modulo 2**64: of 2**20 points, two with the same value are
+    expected once in 30 million scenes, and would share an entry, whose error is measured like any other.
+    """
+    factors: I64 = np.random.default_rng(0).integers(1, 1 << 63, size=(points.shape[1],), dtype=np.int64)
+    keys = np.zeros(len(points), np.int64)
+    for column in range(points.shape[1]):
+        keys += points[:, column] * (factors[column] | 1)
+    _, rows, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return rows, inverse.reshape(-1)
 
 
 def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOptions) -> int:

@@ -26,7 +26,14 @@ from csplat.encoder.entropy import DeflateSettings, signed_stream
 from csplat.encoder.entry_search import search_nearest
 from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.kmeans import cluster, rank_by_frequency, reassign_by_metric
-from csplat.encoder.quantisation import canonicalise_shape, lattice_exponent, lattice_values, quat_levels, quat_values
+from csplat.encoder.quantisation import (
+    canonicalise_shape,
+    lattice_exponent,
+    lattice_values,
+    quat_levels,
+    quat_values,
+    rotation_on_lattice,
+)
 from csplat.encoder.splat_importance import ErrorMetric
 from csplat.encoder.tiling import TileSplats, quantise_and_sort
 from csplat.model import SplatModel
@@ -284,7 +291,11 @@ def _canonical(quats: F32, scales: F32, parameters: CodingParameters) -> tuple[F
 
     With `parameters.canonical` they are in this order already.
     """
-    return (quats.T, scales.T) if parameters.canonical else canonicalise_shape(quats, scales)
+    if parameters.canonical:
+        return quats.T, scales.T
+    if not parameters.sorts_axes:
+        return rotation_on_lattice(quats, parameters.quat_levels), scales.T
+    return canonicalise_shape(quats, scales)
 
 
 @dataclass(frozen=True, eq=False)

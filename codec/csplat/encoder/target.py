@@ -46,7 +46,8 @@ class Target:
             file, or the fewest splats.
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         max_error: largest error of any splat by measure of the format: means in scene units, covariance relative,
-            opacities, sh0 to sh4. Alone it requires no rendering.
+            opacities, sh0 to sh4. Alone it requires no rendering. 0 keeps the values of SPZ, except rotations of its
+            versions 1 and 2, and alpha of SOG; `covariance` and `sh0` then differ by roundings to float32.
         prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes less
             than half of the time.
         effort: 1 to 9, work of the search: number of views, candidates and refit steps.
@@ -93,8 +94,10 @@ class Target:
                 raise InputError(
                     f"{name!r} is not a measure of errors, expected one of {', '.join(MEASURE_NAMES.values())}"
                 )
-            if not (math.isfinite(bound) and bound > 0.0):
-                raise InputError(f"the largest error of {name} is {bound:g}, expected above 0")
+            if not (math.isfinite(bound) and bound >= 0.0):
+                raise InputError(f"the largest error of {name} is {bound:g}, expected at least 0")
+            if bound == 0.0 and requested:
+                raise InputError(f"{requested[0]} excludes a largest error of 0, which determines the steps of {name}")
 
     @property
     def size_bytes(self) -> int | None:

@@ -183,8 +183,10 @@ def dequantise_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters
     """Return decoded alpha, [N]."""
     decoded, levels = np.empty_like(opacities), parameters.opacity_levels
     for tile in tiles:
-        q = opacity_levels(opacities[tile.rows], levels, square=True, multiple=tile.factors.opacities)
-        decoded[tile.rows] = opacity_values(q, levels, square=True)
+        q = opacity_levels(
+            opacities[tile.rows], levels, square=parameters.square_opacities, multiple=tile.factors.opacities
+        )
+        decoded[tile.rows] = opacity_values(q, levels, square=parameters.square_opacities)
     return decoded
 
 

@@ -260,13 +260,16 @@ def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None =
     return write_levels(path, [scene], format)
 
 
-def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: str | None = None) -> list[Finding]:
+def write_levels(
+    path: str | os.PathLike[str], levels: Sequence[Scene], format: str | None = None, preset: str = "balanced"
+) -> list[Finding]:
     """Write the levels of detail of a scene block by block.
 
     Args:
         path: as in `write`. Only streamed SOG, a file lod-meta.json in a folder of its own, has several levels.
         levels: the scene at each level, finest first.
         format: as in `write`.
+        preset: precision of the format, see `Format.presets`.
 
     Returns:
         As in `write`.
@@ -276,7 +279,7 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: 
         OSError: the file cannot be written.
     """
     target = Path(path)
-    file_format = format_by_suffix(target) if format is None else format_by_name(format)
+    file_format = (format_by_suffix(target) if format is None else format_by_name(format)).at(preset)
     if file_format.write is None:
         raise InputError(f"{target.name} would be {file_format.title}, which csplat does not write")
     statistics = _clamp_statistics()
@@ -290,9 +293,9 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: 
     return [*_lost_contents(file_format, levels), *_clamped_values(file_format, levels, statistics), *(findings or ())]
 
 
-def survey_losses(levels: Sequence[Scene], format: str) -> list[Finding]:
+def survey_losses(levels: Sequence[Scene], format: str, preset: str = "balanced") -> list[Finding]:
     """Return what `write_levels` returns without writing, except findings that depend on how positions are coded."""
-    file_format = format_by_name(format)
+    file_format = format_by_name(format).at(preset)
     statistics = _clamp_statistics()
     for scene in levels if file_format.ranges else ():
         for _ in () if file_format.keeps(scene) else _watched(scene, file_format, statistics).blocks():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat.detect import KINDS
+from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.scene import Scene
 from csplat.scene_metadata import SRGB, UNSPECIFIED
@@ -70,6 +71,7 @@ class Format:
         ranges: the range of attributes whose values the writer clamps, by name.
         exact: names of the arrays that are stored losslessly; opacities stored as logits come back within an ulp.
         splat_bytes: approximate bytes per splat by SH degree, from 0 to `degree`; empty if that depends on the scene.
+        presets: the same format with another precision, by preset; "balanced" is the format itself.
         carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
             `flat`, `colour_space` and `cameras` that the format stores.
     """
@@ -88,7 +90,15 @@ class Format:
     ranges: Mapping[str, ValueRange] = field(default_factory=dict)
     exact: frozenset[str] = frozenset()
     splat_bytes: tuple[float, ...] = ()
+    presets: Mapping[str, Format] = field(default_factory=dict)
     carries: frozenset[str] = frozenset()
+
+    def at(self, preset: str) -> Format:
+        """Return the format at the precision of a preset; raise an `InputError` if it has no such preset."""
+        if preset != "balanced" and preset not in self.presets:
+            remedy = "csplat encode has it" if self.name == "csplat" else "SPZ has small"
+            raise InputError(f"{self.title} cannot be written with the preset {preset}: {remedy}")
+        return self.presets.get(preset, self)
 
     @property
     def title(self) -> str:

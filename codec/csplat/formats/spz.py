@@ -5,10 +5,11 @@ Versions 1 to 3 are a single gzip stream, version 4 has a Zstandard stream per a
 (https://github.com/nianticlabs/spz) unless an extension specifies others. Some converters store scenes along other axes
 without this extension.
 
-The writer produces version 3, which more programs read, or version 4. SH coefficients get 6 bits each; Niantic's
-library keeps 5 for band 1 and 4 for the others. On three scenes, 6 bits cost 36 to 38 % more bytes and gain 9 to 10 dB;
-a seventh bit would cost 18 % more for 2 to 4 dB, an eighth 16 % for 1 dB. Positions get the usual 12 fractional bits,
-more for fine splats (the maximum would cost up to 9 % more bytes for 0.3 dB at best), fewer if the scene would not fit.
+The writer produces version 3, which more programs read, or version 4. SH coefficients get 6 bits each; with the preset
+"small" they get 5 in band 1 and 4 in the others, as in Niantic's library. On three scenes, 6 bits cost 36 to 38 % more
+bytes and gain 9 to 10 dB; a seventh bit would cost 18 % more for 2 to 4 dB, an eighth 16 % for 1 dB. Positions get the
+usual 12 fractional bits, more for fine splats unless the preset is "small" (the maximum would cost up to 9 % more bytes
+for 0.3 dB at best), fewer if the scene would not fit.
 """
 
 from __future__ import annotations
@@ -261,7 +262,8 @@ _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
 _SMALL_REACH = 2**-8  # scene units; positions up to this fit with `MAX_FRACTION_BITS`
 _STEPS = 32  # minimum number of position steps within the median standard deviation
-_SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
+_SH_STEPS = (4, 4, 4, 4)  # quantisation steps of the SH bands from 1 on, in units of the 256 levels
+_SMALL_SH_STEPS = (8, 16, 16, 16)
 
 
 @contextmanager
@@ -278,16 +280,17 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     yield Scene.like(decode_block(packed, slice(0, 0), degree), packed.count, blocks, packed.findings)
 
 
-def write_spz(path: Path, scene: Scene, *, version: int) -> list[Finding]:
-    """Write version 3 or 4, without extensions (`Format.write`)."""
+def write_spz(path: Path, scene: Scene, *, version: int, small: bool = False) -> list[Finding]:
+    """Write version 3 or 4, without extensions (`Format.write`); `small`: with the preset of this name."""
     scene = convert_axes(scene, SPZ_AXES)
-    degree, bits = scene.sh_degree, _choose_fraction_bits(path, scene)
+    degree, bits = scene.sh_degree, _choose_fraction_bits(path, scene, _USUAL_BITS if small else MAX_FRACTION_BITS)
+    steps = np.repeat(_SMALL_SH_STEPS if small else _SH_STEPS, [3, 5, 7, 9]).astype(np.float32)[:, None]
     flags = ANTIALIASED if scene.metadata.antialiased else 0
     packed = SpzArrays(path.name, version, scene.count, degree, bits, flags)
     data, moved = packed.allocate(), MovedSplats()
     for rows, block in scene.numbered():
         moved.add(block, np.rint(block.means * np.float32(2.0**bits)) * 2.0**-bits)
-        for part, codes in zip(packed.parts, _encode_block(block, bits), strict=True):
+        for part, codes in zip(packed.parts, _encode_block(block, bits, steps), strict=True):
             part[rows] = codes
     parts = [part for part in packed.parts if part.size] if version > 3 else []
     head = _HEADER.pack(_MAGIC, version, scene.count, degree, bits, flags, len(parts))
@@ -316,7 +319,9 @@ def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:
         opacities=np.divide(alphas[:, 0], 255, dtype=np.float32),
         sh0=(np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / _COLOUR,
         shN=shN.reshape(len(rest), coefficients, 3),
-        metadata=SceneMetadata(coordinate_system=packed.axes, antialiased=bool(packed.flags & ANTIALIASED)),
+        metadata=SceneMetadata(
+            coordinate_system=packed.axes, antialiased=bool(packed.flags & ANTIALIASED), quantised=True
+        ),
     )
 
 
@@ -349,8 +354,8 @@ def _decode_rotations(rotations: U8) -> F32:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def _choose_fraction_bits(path: Path, scene: Scene) -> int:
-    """Choose the number of fractional bits of positions: enough for the median splat, limited by the scene's extent.
+def _choose_fraction_bits(path: Path, scene: Scene, most: int) -> int:
+    """Choose the fractional bits of positions: enough for the median splat, at most `most` and what the extent allows.
 
     Raises:
         InputError: a position exceeds the range of SPZ.
@@ -368,13 +373,20 @@ def _choose_fraction_bits(path: Path, scene: Scene) -> int:
     median_log = middle / 16 - 10  # the inverse of `_scale_codes`
     fine = math.ceil(math.log2(_STEPS) - median_log / math.log(2))
     fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > _SMALL_REACH else MAX_FRACTION_BITS
-    return min(max(fine, _USUAL_BITS), fitting)
+    return min(max(fine, _USUAL_BITS), fitting, most)
 
 
-def _encode_block(model: SplatModel, bits: int) -> tuple[U8, ...]:
-    """Encode splats to bytes, [n, width] per attribute, in the order of the file; positions have fractional `bits`."""
+def _encode_block(model: SplatModel, bits: int, sh_steps: F32) -> tuple[U8, ...]:
+    """Encode splats to bytes, [n, width] per attribute, in the order of the file.
+
+    Args:
+        model: the splats.
+        bits: fractional bits of positions.
+        sh_steps: [24, 1], step of each SH coefficient, in units of the 256 levels.
+    """
     fixed = np.rint(model.means * np.float32(2.0**bits)).astype("<i4")
-    rest = np.rint(model.shN * np.float32(128 / _SH_STEP)) * np.float32(_SH_STEP) + np.float32(128)
+    steps = sh_steps[: model.shN.shape[1]]
+    rest = np.rint(model.shN * (np.float32(128) / steps)) * steps + np.float32(128)
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),
         round_to_bytes(model.opacities[:, None] * np.float32(255)),
@@ -400,23 +412,39 @@ def _encode_rotations(quats: F32) -> U8:
     return words[:, None].view(np.uint8)
 
 
-FORMAT = Format(
-    name="spz",
-    open=_open,
-    open_bands=_open,
-    write=partial(write_spz, version=3),
-    axes=SPZ_AXES,
-    ranges={
-        "scales": ValueRange(-10.0, 5.9375, 1 / 16),
-        "sh0": ValueRange(-0.5 / 0.15, 0.5 / 0.15, 1 / (255 * 0.15)),
-        "shN": ValueRange(-1.0, 127 / 128, _SH_STEP / 128),
-    },
-    splat_bytes=(16.5, 19.3, 23.9, 29.7),
-    carries=frozenset({"antialiased"}),
-)
+def _format(name: str, version: int, degree: int, splat_bytes: tuple[float, ...], *, small: bool) -> Format:
+    """Return the format of a version, at the precision of "balanced" or "small".
+
+    Args:
+        name: name of the format.
+        version: version that it writes.
+        degree: highest SH degree.
+        splat_bytes: as in `Format`.
+        small: True for the preset of this name.
+    """
+    return Format(
+        name=name,
+        open=_open,
+        open_bands=_open,
+        write=partial(write_spz, version=version, small=small),
+        degree=degree,
+        axes=SPZ_AXES,
+        ranges={
+            "scales": ValueRange(-10.0, 5.9375, 1 / 16),
+            "sh0": ValueRange(-0.5 / 0.15, 0.5 / 0.15, 1 / (255 * 0.15)),
+            "shN": ValueRange(-1.0, 127 / 128, (_SMALL_SH_STEPS if small else _SH_STEPS)[0] / 128),
+        },
+        splat_bytes=splat_bytes[: degree + 1],
+        carries=frozenset({"antialiased"}),
+    )
 
 
-# Readers of version 3 that are older than version 4 refuse degree 4.
-FORMAT_4 = replace(
-    FORMAT, name="spz4", write=partial(write_spz, version=4), degree=4, splat_bytes=(*FORMAT.splat_bytes, 36.2)
+_SPLAT_BYTES, _SMALL_SPLAT_BYTES = (16.5, 19.3, 23.9, 29.7, 36.2), (16.5, 18.5, 19.8, 20.7, 22.0)
+
+FORMAT, FORMAT_4 = (
+    replace(
+        _format(name, version, degree, _SPLAT_BYTES, small=False),
+        presets={"small": _format(name, version, degree, _SMALL_SPLAT_BYTES, small=True)},
+    )
+    for name, version, degree in (("spz", 3, 3), ("spz4", 4, 4))  # older readers of version 3 refuse degree 4
 )

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The encoder: files that csplat-decoder reads, errors, progress, workers. That its files equal those of the encoder in C, whose
-// tests compare them with Python's, is tested by tests/system/test_js_encoder.py.
+// The encoder: files that csplat-decoder reads, errors, progress, workers. Also: tasks. That its files equal those of the encoder
+// in C, whose tests compare them with Python's, is tested by tests/system/test_js_encoder.py.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
@@ -19,12 +19,12 @@ async function someSplats(count) {
   return /** @type {import('../encoder.d.ts').Splats} */ (Object.fromEntries(parts));
 }
 
-/** A PLY of one splat in text. @param {string[]} values */
-function textPly(values) {
+/** A PLY in text. @param {string[][]} rows */
+function textPly(...rows) {
   const names = 'x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 opacity f_dc_0 f_dc_1 f_dc_2'.split(' ');
   const lines = names.map((name) => `property float ${name}`);
-  const text = ['ply', 'format ascii 1.0', 'element vertex 1', ...lines, 'end_header', values.join(' '), ''];
-  return new TextEncoder().encode(text.join('\n'));
+  const text = ['ply', 'format ascii 1.0', `element vertex ${rows.length}`, ...lines, 'end_header'];
+  return new TextEncoder().encode([...text, ...rows.map((row) => row.join(' ')), ''].join('\n'));
 }
 
 test('encodes what the decoder decodes, near the source and within the source index', async () => {
@@ -47,8 +47,8 @@ test('encodes what the decoder decodes, near the source and within the source in
 
 test('encodes a PLY, here and in a worker, to the same bytes', async () => {
   const expected = await encode(await readPly(sample));
-  assert.deepEqual(await encodePly(sample), expected);
-  assert.deepEqual(await encodePly(sample, { worker: true }), expected);
+  assert.deepEqual((await encodePly(sample)).file, expected);
+  assert.deepEqual((await encodePly(sample, { worker: true })).file, expected);
   const splats = await readPly(sample.buffer, { worker: true });
   const sourceIndex = new Uint32Array(splats.opacities.length);
   assert.deepEqual(await encode(splats, { worker: true, sourceIndex }), expected);
@@ -98,6 +98,15 @@ test('reads numbers in text', async () => {
   assert.deepEqual([...scales], [-88, -1, 0.5]);
   assert.deepEqual([...opacities], [1]);
   assert.deepEqual([...sh0], [1, -0, Math.fround(0.01)]);
+});
+
+test('reports rows that are left out', async () => {
+  const ones = Array(14).fill('1');
+  const ply = textPly(ones, ['nan', ...ones.slice(1)], [...ones.slice(1), '-inf'], ones);
+  for (const worker of [false, true]) {
+    const { file, splatCount, rowCount } = await encodePly(ply, { worker });
+    assert.deepEqual([splatCount, rowCount, (await decode(file.buffer)).count], [2, 4, 2]);
+  }
 });
 
 test('refuses invalid input with one line', async () => {

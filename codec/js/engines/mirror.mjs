@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Mirrors packed tiles in x, for left-handed scenes in engines that can rotate splats but not mirror them.
+// Mirrors packed tiles along axes: for left-handed scenes in engines that can rotate splats but not mirror them, and for
+// scenes whose axes become the engine's by signs alone.
 
 /**
  * @typedef {import('../decoder.d.ts').Packed} Packed
@@ -7,7 +8,12 @@
  * @typedef {import('../decoder.d.ts').PackedGeometry} PackedGeometry
  */
 
-const ODD = [[], [2], [0, 3], [1, 4, 6]]; // per band, the coefficients whose basis function is odd in x
+// Per axis and band, the coefficients whose basis function is odd along the axis.
+const ODD = [
+  [[], [2], [0, 3], [1, 4, 6]],
+  [[], [0], [0, 1], [0, 1, 2]],
+  [[], [1], [1, 3], [1, 3, 5]],
+];
 
 /** @type {WeakMap<PackedColumns, PackedColumns>} mirrored codebook tables, which many tiles share */
 const tables = new WeakMap();
@@ -15,22 +21,27 @@ const tables = new WeakMap();
 /**
  * @template {PackedGeometry} T
  * @param {T} tile
+ * @param {number[]} signs of each axis, −1: mirror along it
  * @returns {T}
  */
-export const mirroredGeometry = (tile) => ({
-  ...tile,
-  means: negated(tile.means, [0]),
-  quats: negated(tile.quats, [1, 2]), // mirrors the axis and reverses the angle
-});
+export function mirroredGeometry(tile, signs) {
+  const handedness = signs[0] * signs[1] * signs[2]; // −1 reverses the angles of rotations
+  const negative = (/** @type {number} */ factor) => [0, 1, 2].filter((axis) => factor * signs[axis] < 0);
+  return { ...tile, means: negated(tile.means, negative(1)), quats: negated(tile.quats, negative(handedness)) };
+}
 
 /**
  * @param {Packed} band
  * @param {number} layer 1 to 3
+ * @param {number[]} signs of each axis, −1: mirror along it
  * @returns {Packed}
  */
-export function mirroredBand(band, layer) {
+export function mirroredBand(band, layer, signs) {
   const terms = 2 * layer + 1;
-  const columns = [0, 1, 2].flatMap((channel) => ODD[layer].map((term) => channel * terms + term));
+  const signOf = (/** @type {number} */ term) =>
+    signs.reduce((sign, one, axis) => (ODD[axis][layer].includes(term) ? sign * one : sign), 1);
+  const negative = Array.from({ length: terms }, (_, term) => term).filter((term) => signOf(term) < 0);
+  const columns = [0, 1, 2].flatMap((channel) => negative.map((term) => channel * terms + term));
   const mirrored = { ...band, ...negated(band, columns) };
   if (!band.lookup) return mirrored;
   const { table } = band.lookup;

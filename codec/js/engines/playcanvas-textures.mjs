@@ -2,8 +2,6 @@
 // Stores a file's integers in textures for PlayCanvas, in the narrowest format that the scene allows. Independent of the
 // engine, for testing.
 
-import { places, putColumns } from './packed_values.mjs';
-
 /**
  * @typedef {import('../decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('../decoder.d.ts').Header} Header
@@ -39,10 +37,8 @@ export function imagesOf(header, tiles, maxSize) {
     csColours: image(colours.bits),
     csTiles: tileTable(tiles, maxSize),
   };
-  const centers = new Float32Array(3 * count);
   for (const { index, first } of header.tiles) {
     const tile = tiles[index];
-    putColumns(tile.means, places(centers, 3, 0), first, (mean) => mean);
     putElements(tile.means, images.csMeans.texels, first);
     for (let i = first; i < first + tile.count; i++) images.csMeans.texels[4 * i + 3] = index;
     putElements(tile.scales, images.csShapes.texels, first, scales);
@@ -58,7 +54,28 @@ export function imagesOf(header, tiles, maxSize) {
     csLows: [0, 0, 0, header.flat ? 1 : 0],
     csSteps: [0, 0, 0, 0],
   };
-  return { images, parameters, centers };
+  const { texels } = images.csMeans;
+  const lattices = header.tiles.map(({ index, first }) => {
+    const { count, means: { offsets, step } } = tiles[index]; // prettier-ignore
+    return { first, end: first + count, offsets, step };
+  });
+  return { images, parameters, centersOf: () => centersOf(texels, lattices) };
+}
+
+/**
+ * Return the means, for engines that sort on the CPU.
+ *
+ * @param {Texels} texels of the means
+ * @param {{first: number, end: number, offsets: number[], step: number}[]} lattices of each tile, in order
+ */
+function centersOf(texels, lattices) {
+  const centers = new Float32Array(3 * (lattices.at(-1)?.end ?? 0));
+  for (const { first, end, offsets, step } of lattices) {
+    for (let i = first; i < end; i++) {
+      for (let c = 0; c < 3; c++) centers[3 * i + c] = (offsets[c] + texels[4 * i + c]) * step;
+    }
+  }
+  return centers;
 }
 
 /**

@@ -139,10 +139,10 @@ class CsplatResource extends pc.GSplatResourceBase {
    * @param {ReturnType<typeof imagesOf>} made
    * @param {object} options
    */
-  constructor(device, scene, header, { images, parameters, centers }, options) {
+  constructor(device, scene, header, { images, parameters, centersOf }, options) {
     const corners = scene.corners(pc.Vec3, header);
     const calcAabb = (/** @type {any} */ aabb) => header.tiles.length && aabb.setMinMax(...corners);
-    super(device, { numSplats: header.splatCount, shBands: 0, getCenters: () => centers, calcAabb }, options);
+    super(device, { numSplats: header.splatCount, shBands: 0, getCenters: centersOf, calcAabb }, options);
     this.header = header;
     this.scene = scene;
     /** @type {{name: string, format: number}[]} */

@@ -30,9 +30,10 @@ const MOST = 0.9; // fraction of the sample within the bounds
  *
  * @param {Parameters<typeof CsplatReader.open>[0]} from
  * @param {LoadOptions} options
- * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number, maxSplats?: number}} target name of the
- *   adapter; letters of the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix; its
- *   highest SH degree; the engine's own default of the option
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, aligns?: boolean, shDegree: number, maxSplats?: number}} target
+ *   name of the adapter; letters of the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix;
+ *   whether tiles have the engine's axes if signs suffice for that; its highest SH degree; the engine's own default of the
+ *   option
  * @param {(AbortSignal | undefined)[]} [signals] further signals that abort the load
  */
 export async function openScene(from, options, target, signals = []) {
@@ -130,19 +131,11 @@ export class SplatScene {
    * @param {TileRecord[]} version its tiles
    * @param {Pick<import('../decoder.d.ts').Description, 'metadata' | 'cameras'>} description
    * @param {{degree: number, progressive: boolean, workers: number}} wanted
-   * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
+   * @param {{engine: 'RUB' | 'RUF', mirrors: boolean, aligns?: boolean}} target
    * @param {Life} life
    * @param {LevelScene | null} [levels]
    */
-  constructor(
-    reader,
-    version,
-    { metadata, cameras },
-    { degree, progressive, workers },
-    { engine, mirrors },
-    life,
-    levels = null,
-  ) {
+  constructor(reader, version, { metadata, cameras }, { degree, progressive, workers }, target, life, levels = null) {
     /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
     /** The header of the file. */
@@ -167,13 +160,12 @@ export class SplatScene {
     /** What streams the levels of detail, if they are drawn by what the camera sees. */
     this.levels = levels;
     this.isShown = false;
-    const [a, b, c] = uprightIn(reader.header, metadata, engine);
-    const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
-    /** True if the tiles are mirrored, −x for x, because the engine can only rotate them. */
-    this.mirrored = determinant < 0 && !mirrors;
-    /** 3 × 3, by rows: makes the scene upright. */
-    this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
-    this.view = uprightView(reader.header, { metadata, cameras }, [a, b, c]);
+    const upright = uprightIn(reader.header, metadata, target.engine);
+    /** Of each axis, −1 if the tiles are mirrored along it. */
+    this.signs = signsFor(upright, uprightIn(reader.header, null, target.engine), target);
+    /** 3 × 3, by rows: makes the tiles upright. */
+    this.upright = this.mirroredColumns(upright);
+    this.view = uprightView(reader.header, { metadata, cameras }, upright);
   }
 
   /**
@@ -210,25 +202,35 @@ export class SplatScene {
    */
   look(modelView, projection, { width, height, near }) {
     const scale = Math.hypot(modelView[0], modelView[1], modelView[2]) || 1;
-    const signs = [1, -1, -1, this.mirrored ? -1 : 1];
+    const flips = [1, -1, -1]; // of the camera's axes, whose z points forward in `viewmat`
+    const signs = [...this.signs, 1];
     const viewmat = Array.from({ length: 16 }, (_, at) => {
       const [row, column] = [at >> 2, at & 3];
       if (row === 3) return column === 3 ? 1 : 0;
-      return (modelView[4 * column + row] * signs[row] * (column === 0 ? signs[3] : 1)) / scale;
+      return (modelView[4 * column + row] * flips[row] * signs[column]) / scale;
     });
     const [fx, fy] = [0.5 * width * projection[0], 0.5 * height * projection[5]];
     const [cx, cy] = [0.5 * width * (1 - projection[8]), 0.5 * height * (1 + projection[9])];
     this.levels?.update({ viewmat, fx, fy, cx, cy, near: near / scale, width, height });
   }
 
+  get isMirrored() {
+    return this.signs.includes(-1);
+  }
+
+  /** @param {number[][]} rows 3 × 3: between the file's coordinates and those of the tiles */
+  mirroredColumns(rows) {
+    return rows.map((row) => row.map((value, k) => value * this.signs[k]));
+  }
+
   /** @template {import('../decoder.d.ts').PackedGeometry} T @param {T} tile @returns {T} as the engine draws it */
   geometry(tile) {
-    return this.mirrored ? mirroredGeometry(tile) : tile;
+    return this.isMirrored ? mirroredGeometry(tile, this.signs) : tile;
   }
 
   /** @template {Packed | null} T @param {T} band @param {number} layer @returns {T} as the engine draws it */
   band(band, layer) {
-    return this.mirrored && band ? /** @type {T} */ (mirroredBand(band, layer)) : band;
+    return this.isMirrored && band ? /** @type {T} */ (mirroredBand(band, layer, this.signs)) : band;
   }
 
   /**
@@ -244,7 +246,7 @@ export class SplatScene {
     const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
       [0, 1, 2].map((axis) => Math[side](...all.map((tile) => tile[side][axis]))),
     );
-    if (this.mirrored) [low[0], high[0]] = [-high[0], -low[0]];
+    for (const [k, sign] of this.signs.entries()) if (sign < 0) [low[k], high[k]] = [-high[k], -low[k]];
     return [new Vector(low[0], low[1], low[2]), new Vector(high[0], high[1], high[2])];
   }
 
@@ -345,7 +347,7 @@ export class SplatScene {
 
   /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */
   get bounds() {
-    const turn = this.mirrored ? this.upright.map(([x, y, z]) => [-x, y, z]) : this.upright;
+    const turn = this.mirroredColumns(this.upright);
     const centre = [0, 1, 2].map((axis) => quantile(this.sample.map((mean) => mean[axis]), 0.5)); // prettier-ignore
     const away = this.sample.map((mean) => Math.hypot(...mean.map((value, axis) => value - centre[axis])));
     return {
@@ -395,6 +397,20 @@ function uprightView(header, description, upright) {
     from,
     fov,
   };
+}
+
+/**
+ * Return −1 for each axis along which tiles have to be mirrored.
+ *
+ * @param {number[][]} upright 3 × 3, by rows
+ * @param {number[][]} along the same without the file's up direction
+ * @param {{mirrors: boolean, aligns?: boolean}} target
+ */
+function signsFor([a, b, c], along, { mirrors, aligns }) {
+  const diagonal = along.map((row, k) => row[k]);
+  if (aligns && !diagonal.includes(0)) return diagonal;
+  const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
+  return determinant < 0 && !mirrors ? [-1, 1, 1] : [1, 1, 1];
 }
 
 /** @param {import('../decoder.d.ts').PackedGeometry} tile */

@@ -10,8 +10,12 @@ export type { LoadOptions };
 export type SplatGeometry = BufferGeometry & {
   userData: {
     /** `complete` resolves to the geometry with SH: the same one, or after a progressive load another one, for a new
-     * GaussianSplat. `upright` makes the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. */
+     * GaussianSplat. */
     csplat: SceneFacts<SplatGeometry> & {
+      /** From the file's coordinates to those of the geometry, which are right, up, back if signs suffice for that. */
+      fromFile: Matrix4;
+      /** Makes the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. The identity, unless the file
+       * has an up direction or axes that signs alone do not change to these. */
       upright: Matrix4;
       /** With the option `levels`: from now on, draw in this object what the camera of each frame requires. */
       refine(splats: GaussianSplat): void;
@@ -19,7 +23,7 @@ export type SplatGeometry = BufferGeometry & {
   };
 };
 
-/** Loads `.csplat` as a geometry for `GaussianSplat` of three/addons. Invalid files cause `CsplatError`s. */
+/** Loads `.csplat` as the geometry that `SPZLoader` of three/addons returns, for its `GaussianSplat`. Invalid files cause `CsplatError`s. */
 export class CSPLATLoader extends Loader<SplatGeometry> {
   constructor(manager?: LoadingManager);
   setOptions(options: LoadOptions): this;

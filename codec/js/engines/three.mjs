@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A loader for three.js: loads a .csplat as the same geometry as three.js's own splat loaders. See three.d.ts.
+// A loader for three.js: loads a .csplat as the geometry that three.js's own SPZLoader returns. See three.d.ts.
 //
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');
 //   const splats = new GaussianSplat(geometry); // from three/addons/objects/GaussianSplat.js
@@ -23,7 +23,7 @@ import { displayColour, onceSaid, places, putAlphas, putBand, putColumns, putCov
  */
 
 const NAME = 'CSPLATLoader';
-const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true, shDegree: 3 };
+const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true, aligns: true, shDegree: 3 };
 const SH_WORDS = [0, 3, 4, 6]; // words per splat in a band, of four coefficients each
 const SH_ZERO = 0x80808080;
 
@@ -155,7 +155,8 @@ async function geometryOf(scene) {
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
   const refine = (/** @type {GaussianSplat} */ splats) => drawing?.start(splats);
-  geometry.userData = { csplat: { ...facts, upright, refine } };
+  const [x, y, z] = scene.signs;
+  geometry.userData = { csplat: { ...facts, fromFile: new Matrix4().makeScale(x, y, z), upright, refine } };
   geometry.addEventListener('dispose', () => scene.abort());
   return geometry;
 }

@@ -24,6 +24,7 @@ declare module 'three' {
   export class Matrix4 {
     elements: number[];
     set(...rows: number[]): this;
+    makeScale(x: number, y: number, z: number): this;
     multiplyMatrices(a: Matrix4, b: Matrix4): this;
   }
   export class Vector2 {

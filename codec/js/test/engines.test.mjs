@@ -4,7 +4,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
-import { openScene } from '../engines/scene.mjs';
+import { SplatScene, openScene } from '../engines/scene.mjs';
 import { mirroredBand, mirroredGeometry } from '../engines/mirror.mjs';
 import {
   places,
@@ -98,26 +98,45 @@ test("unpacked numbers of every vector equal the decoder's", async () => {
   assert.deepEqual(failed, {});
 });
 
-for (const name of ['valid/rich', 'valid/codebook_sh_1_3', 'valid/combined_tiles']) {
-  test(`${name}: mirroring changes exactly the signs of values that are odd in x`, async () => {
+// Per axis, the SH coefficients that are odd along it: y z x, xy yz zz xz xx, …
+const ODD = [
+  [0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 1],
+  [1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 1, 0, 0, 0, 0],
+  [0, 1, 0, 0, 1, 0, 1, 0, 0, 1, 0, 1, 0, 1, 0],
+];
+for (const [name, mirror] of [
+  ['valid/rich', [1, -1, -1]],
+  ['valid/rich', [1, -1, 1]],
+  ['valid/codebook_sh_1_3', [-1, 1, 1]],
+  ['valid/codebook_sh_1_3', [-1, -1, -1]],
+  ['valid/combined_tiles', [-1, 1, 1]],
+]) {
+  test(`${name}: mirroring by ${mirror} changes exactly the signs of values that are odd`, async () => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const { header } = reader;
-    const odd = [0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 1]; // y z x, xy yz zz xz xx, …
+    const negative = mirror.map((sign) => (sign < 0 ? 1 : 0));
+    const reversed = (negative[0] + negative[1] + negative[2]) % 2; // axes of rotations are no vectors
+    const odd = ODD[0].map((_, i) => negative.reduce((sum, one, axis) => sum + one * ODD[axis][i], 0) % 2);
     for (const { index, splatCount: count } of header.tiles) {
       const floats = await reader.readTile(index);
       const packed = await reader.readTile(index, { form: 'packed' });
-      const tile = mirroredGeometry(packed);
+      const tile = mirroredGeometry(packed, mirror);
       const [means, quats] = [new Float32Array(3 * count), new Float32Array(4 * count)];
       putColumns(tile.means, places(means, 3, 0), 0, same);
       putQuats(tile.quats, header, places(quats, 4, 0, 4), 0, same);
       const signed = (values, signs) => values.map((value, i) => (signs[i % signs.length] ? -value : value) + 0);
-      assert.deepEqual(signed(means, [0]), signed(floats.means, [1, 0, 0]));
-      assert.deepEqual(signed(quats, [0]), signed(floats.quats, [0, 0, 1, 1]));
+      assert.deepEqual(signed(means, [0]), signed(floats.means, negative));
+      assert.deepEqual(signed(quats, [0]), signed(floats.quats, [0, ...negative.map((one) => one ^ reversed)]));
       const terms = floats.shN.length / count / 3;
       const shN = new Float32Array(3 * terms * count);
       for (const [i, band] of packed.sh.entries()) {
         if (band)
-          putBand(mirroredBand(band, i + 1), places(shN, 3 * terms, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)), 0, same);
+          putBand(
+            mirroredBand(band, i + 1, mirror),
+            places(shN, 3 * terms, 3 * ((i + 1) ** 2 - 1), 3 * (2 * i + 3)),
+            0,
+            same,
+          );
       }
       const signs = odd.slice(0, terms).flatMap((one) => [one, one, one]);
       assert.deepEqual(signed(shN, [0]), signed(floats.shN, signs));
@@ -179,6 +198,33 @@ test('scenes are upright in the axes of an engine', () => {
 });
 
 const TARGET = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
+
+test('tiles have the axes of an engine that asks for them, if signs suffice', () => {
+  const of = (axes, metadata) =>
+    new SplatScene(
+      { header: { axes, tiles: [], splatCount: 0 } },
+      [],
+      { metadata, cameras: null },
+      {},
+      { ...TARGET, aligns: true },
+    );
+  const turned = (axes, metadata = null) => of(axes, metadata).upright.map((row) => row.map((value) => value + 0));
+  const unit = [0, 1, 2].map((k) => [0, 1, 2].map((i) => (i === k ? 1 : 0)));
+  for (const [axes, signs] of Object.entries({
+    '': [1, -1, -1],
+    RUB: [1, 1, 1],
+    LUF: [-1, 1, -1],
+    LDF: [-1, -1, -1],
+  })) {
+    assert.deepEqual([of(axes, null).signs, turned(axes)], [signs, unit]);
+  }
+  assert.deepEqual(of('RFU', null).signs, [1, 1, 1]);
+  assert.deepEqual(turned('RFU'), uprightIn({ axes: 'RFU' }, null, 'RUB'));
+  // In these tiles, up is 0, 0.8, 0.6.
+  const [, y] = turned('', { up: [0, -0.8, -0.6] });
+  assert.deepEqual(y, [0, 0.8, 0.6]);
+});
+
 for (const [name, options] of [
   ['valid/combined_codebooks', {}],
   ['valid/combined_codebooks', { progressive: true }],

@@ -14,7 +14,7 @@ from formats_cases import same
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import format_by_name, read_scene
+from csplat.formats import format_by_name, read_scene, write_levels
 from csplat.scene import Scene
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
@@ -207,3 +207,20 @@ def test_a_scene_without_axes_is_written_as_rdf(tmp_path, make_model):
     np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)
     csplat.write(tmp_path / "b.spz", make_model(5, 3, means=model.means, coordinate_system="RDF"))
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.v4.spz"])
+def test_the_preset_small_has_fewer_bits_of_sh_and_of_fine_positions(tmp_path, make_model, name):
+    model = make_model(300, 3, coordinate_system="RUB", scales=np.full((300, 3), -7.5, "f4"))
+    model = replace(model, shN=np.clip(model.shN / 4, -0.9, 0.9))
+    write_levels(tmp_path / name, [Scene.of(model)])
+    whole = (tmp_path / name).stat().st_size
+    write_levels(tmp_path / name, [Scene.of(model)], preset="small")
+    assert 12 == fields(tmp_path / name)[3]
+    assert (tmp_path / name).stat().st_size < 0.85 * whole
+    found = checked(tmp_path / name).shN
+    for band, half in ((slice(0, 3), 1 / 32), (slice(3, 15), 1 / 16)):
+        worst = np.abs(found[:, band] - model.shN[:, band]).max()
+        assert half / 2 < worst <= half + 1e-6
+    with pytest.raises(InputError, match="SPZ cannot be written with the preset fast"):
+        write_levels(tmp_path / "a.spz", [Scene.of(model)], preset="fast")

@@ -12,6 +12,7 @@ import typer
 
 from csplat.disk_files import FOLDER_NAMES
 from csplat.editing.transform import DEFAULT_AXES
+from csplat.encoder import PresetName
 from csplat.errors import counted
 from csplat.scene_metadata import UNSPECIFIED
 from csplat_tools.cli import shared_options as shared
@@ -31,6 +32,9 @@ def convert(
     drop_floaters: Annotated[bool, typer.Option("--drop-floaters", help="Drop splats far from others.")] = False,
     up: shared.Up = None,
     sh_degree: shared.ShDegree = None,
+    preset: Annotated[
+        PresetName, typer.Option(metavar="PRESET", hidden=True, help="For SPZ: balanced or small. Default: balanced.")
+    ] = "balanced",
     compress: Annotated[bool, typer.Option("--compress", help="Compress the splats of a .glb.")] = False,
     no_loss: Annotated[bool, typer.Option("--no-loss", help="Refuse if anything would be lost.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report losses and size, write nothing.")] = False,
@@ -102,7 +106,7 @@ def convert(
     with out.bar() as progress:
         made = convert_file(
             source, output, read_as=read_as, write_as=write_as, level=chosen, max_splats=max_splats,
-            overrides=overrides, filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
+            overrides=overrides, filters=filters, no_loss=no_loss, dry_run=dry_run, preset=preset, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
     if made.source_count and not made.count:

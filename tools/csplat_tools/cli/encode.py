@@ -45,7 +45,7 @@ def encode(
     target_psnr: shared.TargetPsnr = None,
     target_size: shared.TargetSize = None,
     max_psnr_drop: shared.MaxPsnrDrop = None,
-    max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="E.g. means=0.001,sh0=0.02.")] = None,
+    max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="E.g. means=0.001,sh0=0.02, or 0.")] = None,
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     levels: Annotated[
@@ -98,10 +98,11 @@ def encode(
     chooses the precision and prunes splats; it goes on as long as it expects to
     save 1 % of the bytes per 10 CPU seconds, and Ctrl-C takes the best file so
     far that meets the target. --max-error limits errors of means, covariance,
-    opacities, sh0 to sh4. Views are virtual without --data, which requires the
-    render extra, or --cameras. --levels adds coarser versions of the scene,
-    which viewers show first: 35 % more bytes, and minutes; merged takes seconds,
-    and looks worse. --help-all shows --keep, --cameras, --up and all others.
+    opacities, sh0 to sh4; --max-error 0 keeps the values of SPZ. Views are
+    virtual without --data, which requires the render extra, or --cameras.
+    --levels adds coarser versions of the scene, which viewers show first: 35 %
+    more bytes, and minutes; merged takes seconds, and looks worse. --help-all
+    shows --keep, --cameras, --up and all others.
 
     Examples:
       csplat encode scene.ply scene.csplat

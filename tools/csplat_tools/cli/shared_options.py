@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
+from csplat._spec import MEASURE_NAMES
 from csplat.disk_files import resolve_links
 from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
@@ -495,13 +496,16 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
     """Parse bounds by measure from `means=0.001,opacities=0.01`.
 
     Args:
-        text: the user's text; lengths may have a unit, such as `means=2mm`, if the scene's unit is known.
+        text: the user's text; lengths may have a unit, such as `means=2mm`, if the scene's unit is known. `0` is the
+            bound of all measures.
         unit_metres: length of a scene unit in metres; `None` if unknown.
 
     Raises:
         InputError: the text is invalid; or a length has a unit, and the scene's unit is unknown.
     """
     bounds: dict[str, float] = {}
+    if text.strip() == "0":
+        return dict.fromkeys(MEASURE_NAMES.values(), 0.0)
     for part in text.split(","):
         name, _, value = part.partition("=")
         name = name.strip()

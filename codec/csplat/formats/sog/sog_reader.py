@@ -92,7 +92,7 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: 
     sog = read_meta(parts, name)
     images = SogImages.of(sog)
     degree = COEFFICIENTS.index(images.palette.shape[1])
-    metadata = SceneMetadata(antialiased=sog.antialiased, flat=sog.flat)
+    metadata = SceneMetadata(antialiased=sog.antialiased, flat=sog.flat, quantised=True)
 
     def blocks() -> Iterator[SplatModel]:
         for arrays in images.blocks(degree):
@@ -146,6 +146,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
     metadata = SceneMetadata(
         antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
         flat=bool(metas) and all(sog.flat for sog, _ in metas),
+        quantised=True,
     )
     reported: set[int] = set()  # files whose findings are in `findings`: blocks may be read again
 

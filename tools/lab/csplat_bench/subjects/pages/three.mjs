@@ -33,8 +33,9 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
       let inner;
       splats.traverse((one) => { inner = one.isGaussianSplat ? one : inner; });
       const { matrixWorld, splatGeometry } = inner;
-      if (camera) look(eye, camera, matrixWorld);
-      const { complete, levels, refine } = splatGeometry.userData.csplat ?? {};
+      const { complete, fromFile, levels, refine } = splatGeometry.userData.csplat ?? {};
+      const world = fromFile ? fromFile.clone().premultiply(matrixWorld) : matrixWorld;
+      if (camera) look(eye, camera, world);
       refine?.(inner);
       const whole = complete?.then((geometry) => {
         if (geometry === splatGeometry) return;
@@ -42,7 +43,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
         scene.add((splats = standing(geometry)));
       });
       const remove = () => take(scene, splats);
-      return { world: matrixWorld.toArray(), count: splatGeometry.getAttribute('position').count, whole, levels, remove };
+      return { world: world.toArray(), count: splatGeometry.getAttribute('position').count, whole, levels, remove };
     },
     look: (camera, world) => look(eye, camera, new THREE.Matrix4().fromArray(world)),
     close: () => {
