@@ -18,7 +18,7 @@ from chromium import absent, read_pixels
 from command_line import call, invoke
 
 from csplat import EncodeOptions, decode, encode
-from csplat.ply import read_ply
+from csplat.ply import read_ply, write_ply
 from csplat.spherical_harmonics import evaluate_sh
 from csplat_render.camera_files import load_cameras
 from csplat_tools.present.viewer_page import export_element
@@ -51,8 +51,8 @@ console.log(JSON.stringify({
 """
 
 
-def samples(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+def samples(language, text=TEXT):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +63,17 @@ def model(request):
     return decode(encode(replace(part, shN=np.concatenate([part.shN, band], axis=1)), FAST))
 
 
-def copy_decoder(folder):
-    source, target = ROOT / "codec" / "js", folder / "node_modules" / "csplat-decoder"
+def copy_package(folder, source):
+    manifest = json.loads((source / "package.json").read_text("utf-8"))
+    target = folder / "node_modules" / manifest["name"]
     target.mkdir(parents=True)
-    for pattern in ["package.json", *json.loads((source / "package.json").read_text("utf-8"))["files"]]:
+    for pattern in ["package.json", *manifest["files"]]:
         for path in source.glob(pattern):
             (shutil.copytree if path.is_dir() else shutil.copy)(path, target / path.name)
+
+
+def copy_decoder(folder):
+    copy_package(folder, ROOT / "codec" / "js")
 
 
 def install_decoder(folder):
@@ -120,6 +125,40 @@ def test_the_samples_in_javascript(provide, site, tmp_path, model):
     assert count == sum(sizes.values())
     assert {1, 2, 3, 4} == {layer for _, layer, _ in given["bands"]}
     assert all(size == 3 * (2 * layer + 1) * sizes[first] for first, layer, size in given["bands"])
+
+
+GIVEN = """
+const drawn = [], [authorization, signal] = ['Bearer x', new AbortController().signal];
+const newSignedUrl = () => url, draw = ({ count }) => drawn.push(count);
+"""
+# What comes of the samples of a package's page.
+PACKAGES = {
+    "js": "[scene.count, band.count, packed.count, drawn, tiles, nodes.length, signed.header.splatCount]",
+    "js-encoder": "[file.length, edited.length, splats.opacities.length]",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PACKAGES)
+def test_the_samples_of_the_packages_run_in_order(name, site, tmp_path, model):
+    node = shutil.which("node") or absent("the samples in JavaScript need Node.js, which is not installed")
+    copy_package(tmp_path, ROOT / "codec" / name)
+    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=400)))
+    write_ply(tmp_path / "scene.ply", model)
+    file = "scene.csplat" if name == "js" else "scene.ply"
+    url = site.add(f"/{file}", (tmp_path / file).read_bytes())
+    page = "".join(samples("js", (ROOT / "codec" / name / "README.md").read_text("utf-8")))
+    program = f"const url = {url!r};\n{GIVEN}{page}console.log(JSON.stringify({PACKAGES[name]}));\nprocess.exit();\n"
+    (tmp_path / "page.mjs").write_text(program, "utf-8")
+    done = subprocess.run([node, "page.mjs"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 0 == done.returncode, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    if name == "js":
+        half = len(model) // 2
+        assert [len(model), half, half, [half] * 4, [0, 1], 1, len(model)] == told
+    else:
+        assert len(model) == told.pop()
+        assert min(told) > 5 * len(model)
 
 
 @pytest.mark.slow
