@@ -359,14 +359,14 @@ def test_every_kind_type_flag_direction_measure_and_degree_occurs():
         assert {True, False} == {bool(scene.scene_flags & bit) for scene in scenes}
 
 
-GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8").replace("−", "-")
+GUIDE = (ROOT / "spec" / "encoders.md").read_text(encoding="utf-8").replace("−", "-")
 LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 
 
 @pytest.fixture(scope="module")
 def row():
     """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
-    part = GUIDE.split("### Declaring errors")[1].split("So SERR declares")[0]
+    part = GUIDE.split("### E.7 An example of declared errors")[1].split("So SERR declares")[0]
     rows = [re.split(" {2,}", line) for line in part.split("```text")[1].splitlines()]
     table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
 
@@ -417,7 +417,7 @@ def test_the_values_and_the_code_of_the_guide_give_the_declared_errors(row, sour
     near(row("decoded quaternion"), file.quats)
     near(row("decoded alpha"), [[alpha] for alpha in file.opacities])
     near(row("decoded sh0"), file.sh0)
-    code = re.search(r"### Declaring errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
+    code = re.search(r"### E.7 An example of declared errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
     names = {"source": source, "file": file}
     exec(code, names)  # noqa: S102 - the text is the project's own
     for j in range(2):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The decoder in C: it compiles without a warning, passes the conformance suite, and its example runs."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -116,6 +117,46 @@ def test_the_example_prints_the_contents_of_a_file(decoder, tmp_path):
     refused = run([example, VECTORS / "invalid" / "chunk_crc.csplat"])
     assert (0, 1) == (told.returncode, refused.returncode)
     assert re.fullmatch(r"E_CRC at byte \d+ \(CHK-1\): .+\n", refused.stderr)
+
+
+# What the samples of the page about C take as given.
+GIVEN = """
+#include "csplat.h"
+#include "csplat_encode.h"
+#include <stdio.h>
+#include <stdlib.h>
+csplat *file; csplat_error error; csplat_options *options; csplat_source source; csplat_floats floats; csplat_tile tile;
+csplat_scene *scene; csplat_packed_geometry geometry; csplat_packed packed; csplat_columns columns; csplat_ply ply;
+csplat_declared_errors errors; const csplat_node *nodes; csplat_cut cut; int found; const char *text; void **extras;
+uint32_t i, count, *tiles; unsigned degree, band; uint16_t id; void *data; size_t size;
+float *sh, *means, *quats, *scales, *opacities, *sh0, *shN;
+"""
+
+
+def test_the_samples_of_the_page_compile(tmp_path):
+    page = (C / "README.md").read_text(encoding="utf-8")
+    calls, cut, encoding = (block.split("```")[0] for block in page.split("```c\n")[1:])
+    bodies = (calls, cut, f"uint8_t *file;\n{encoding}")
+    functions = [f"int sample{number}(void)\n{{\n{body}return 0;\n}}\n" for number, body in enumerate(bodies)]
+    (tmp_path / "samples.c").write_text("\n".join([GIVEN, *functions]), encoding="utf-8")
+    made = run([COMPILER, "-std=c99", "-Wall", "-Werror", f"-I{C}", "-fsyntax-only", tmp_path / "samples.c"])
+    assert (0, "") == (made.returncode, made.stderr)
+
+
+@in_depth
+def test_the_lines_of_the_page_run(tmp_path):
+    shutil.copytree(C, tmp_path / "c")
+    shutil.copy(VECTORS / "valid" / "worked_example.csplat", tmp_path / "c" / "scene.csplat")
+    page = (C / "README.md").read_text(encoding="utf-8")
+    example, library = (block.split("```")[0] for block in page.split("```sh\n")[1:])
+    told = run(["sh", "-c", example], cwd=tmp_path / "c")
+    assert (0, "") == (told.returncode, told.stderr)
+    assert "2 splats, SH degree 1" in told.stdout
+    if shutil.which("cmake") is None:
+        absent("there is no cmake")
+    made = run(["sh", "-c", library], cwd=tmp_path / "c", env={**os.environ, "DESTDIR": str(tmp_path / "installed")})
+    assert 0 == made.returncode, made.stderr
+    assert {"csplat.h", "csplat.pc"} <= {path.name for path in (tmp_path / "installed").rglob("*")}
 
 
 def test_the_sample_of_the_guide_decodes(decoder, tmp_path):

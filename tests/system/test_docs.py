@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import InThisProcess
+from command_line import InThisProcess, call
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -106,6 +106,13 @@ def test_commands_in_readme_and_guides_and_options_on_result_pages_are_valid():
         name, *words = shlex.split(line, comments=True)[1:]
         commands[name].make_context(name, words, resilient_parsing=False)
     options = {option for command in commands.values() for parameter in command.params for option in parameter.opts}
+    texts.append((ROOT / "codec" / "EMBEDDING.md").read_text("utf-8"))
+    for name, words in re.findall(r"`csplat\s+(?!semantic)([a-z]\w*(?:-\w+)*)\b([^`]*)`", "\n".join(texts)):
+        known = {option for parameter in commands[name].params for option in (*parameter.opts, "--help", "--help-all")}
+        assert set() == set(re.findall(r"--[a-z][\w-]*", words)) - (options if name == "batch" else known), (
+            name,
+            words,
+        )
     for path in (DOCS / "results").glob("*.md"):
         prose = re.sub(r"<!-- table.*?<!-- end -->", "", path.read_text("utf-8"), flags=re.DOTALL)
         words = " ".join(re.findall(r"`([^`]+)`", prose)).split()
@@ -140,6 +147,41 @@ def test_the_python_example_with_a_target_runs(sample_path, tmp_path, monkeypatc
         exec(program, names)  # noqa: S102  # the README's own lines
     assert 0 < len(names["coarse"]) <= 200
     assert 37.5 < float(capsys.readouterr().out.split()[0]) < 60.0
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_views")
+@pytest.mark.parametrize("page", [
+    "tools/docs/guide/batch.md",
+    "tools/docs/guide/formats.md",
+    pytest.param("tools/docs/guide/levels.md", marks=pytest.mark.long),
+    pytest.param("tools/docs/guide/smallest.md", marks=pytest.mark.long),
+    pytest.param("README.md", marks=pytest.mark.long),
+])  # fmt: skip
+def test_the_commands_of_a_page_run_in_order(page, sample_path, tmp_path, monkeypatch):
+    """On the sample as the city, and on a few of its splats as any other scene; orbits have fewer frames."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(batch, "ProcessPoolExecutor", InThisProcess)
+    city = csplat.read(sample_path)
+    few = city.select(range(0, len(city), 90))
+    csplat.write("city.ply", city)
+    given = (
+        ("scene.spz", "capture.sog", "theirs.spz") if page.endswith("formats.md") else ("scene.ply", "scenes/one.ply")
+    )
+    (tmp_path / "scenes").mkdir()
+    for name in given:
+        csplat.write(name, few)
+    if page.endswith("formats.md"):
+        call("encode", "city.ply", "city.csplat", "--levels", "merged")
+    lines = [
+        shlex.split(line, comments=True)
+        for block in blocks((ROOT / page).read_text("utf-8"), "sh")
+        for line in block.splitlines()
+    ]
+    lines = [words[1:] for words in lines if words[0] == "csplat" and words[1] != "view"]
+    assert len(lines) > 1
+    for words in lines:
+        call(*("3" if before == "--orbit" else word for before, word in itertools.pairwise(["", *words])), "--quiet")
 
 
 @pytest.mark.long

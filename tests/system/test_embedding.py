@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unchanged samples of codec/EMBEDDING.md, and `<csplat-view>` in other pages."""
+"""The unchanged samples of codec/EMBEDDING.md, splat_math.mjs, and `<csplat-view>` in other pages."""
 
 import base64
 import gzip
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from dataclasses import replace
@@ -17,56 +18,23 @@ from chromium import absent, read_pixels
 from command_line import call, invoke
 
 from csplat import EncodeOptions, decode, encode
-from csplat.ply import read_ply
+from csplat.ply import read_ply, write_ply
 from csplat.spherical_harmonics import evaluate_sh
 from csplat_render.camera_files import load_cameras
 from csplat_tools.present.viewer_page import export_element
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
+EXAMPLES = ROOT / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")
-
-# The parts of three.js that `points.mjs` uses; its drawing is not checked.
-THREE = """
-const typed = (value, kind) => {
-  if (value instanceof kind) return value;
-  throw new TypeError(`${value} is no ${kind.name}`);
-};
-export const SRGBColorSpace = 'srgb';
-const linear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
-export class Color {
-  setRGB(r, g, b, space) {
-    if (space !== SRGBColorSpace) throw new TypeError('no colour space');
-    return Object.assign(this, { r: linear(r), g: linear(g), b: linear(b) });
-  }
-  toArray(array, at) { array.set([this.r, this.g, this.b], at); }
-}
-export class BufferAttribute {
-  constructor(array, itemSize) { Object.assign(this, { array: typed(array, Float32Array), itemSize }); }
-}
-export class BufferGeometry {
-  attributes = {};
-  setAttribute(name, attribute) { this.attributes[name] = typed(attribute, BufferAttribute); }
-}
-export class PointsMaterial { constructor(options) { Object.assign(this, options); } }
-export class Points {
-  constructor(geometry, material) {
-    Object.assign(this, { geometry: typed(geometry, BufferGeometry), material: typed(material, PointsMaterial) });
-  }
-}
-"""
 
 RUN = """
 import { decode } from 'csplat-decoder';
-import { toThree } from './axes.mjs';
-import { colour } from './colour.mjs';
-import { covariances } from './covariances.mjs';
-import { loadPoints } from './points.mjs';
+import { colour, covariances, toThree } from './splat_math.mjs';
 import { stream } from './stream.mjs';
 
 const [url, directions] = JSON.parse(process.argv[2]);
 const scene = await decode(await (await fetch(url)).arrayBuffer(), { workers: 2 });
-const points = await loadPoints(url);
 const [tiles, bands] = [[], []];
 await stream(url, {
   addTile: (first, part) => tiles.push([first, part.count, Array.from(part.means)]),
@@ -74,9 +42,6 @@ await stream(url, {
 });
 console.log(JSON.stringify({
   workers: scene.workers,
-  position: Array.from(points.geometry.attributes.position.array),
-  colour: Array.from(points.geometry.attributes.color.array),
-  sizes: Object.values(points.geometry.attributes).map(({ itemSize }) => itemSize),
   covariances: Array.from(covariances(scene)),
   colours: directions.map((direction, i) => colour(scene, i, direction)),
   axes: ['', 'RDF', 'RUB', 'RFU'].map(toThree),
@@ -86,8 +51,8 @@ console.log(JSON.stringify({
 """
 
 
-def samples(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+def samples(language, text=TEXT):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -98,20 +63,28 @@ def model(request):
     return decode(encode(replace(part, shN=np.concatenate([part.shN, band], axis=1)), FAST))
 
 
-def copy_decoder(folder):
-    source, target = ROOT / "codec" / "js", folder / "node_modules" / "csplat-decoder"
+def copy_package(folder, source):
+    manifest = json.loads((source / "package.json").read_text("utf-8"))
+    target = folder / "node_modules" / manifest["name"]
     target.mkdir(parents=True)
-    for pattern in ["package.json", *json.loads((source / "package.json").read_text("utf-8"))["files"]]:
+    for pattern in ["package.json", *manifest["files"]]:
         for path in source.glob(pattern):
             (shutil.copytree if path.is_dir() else shutil.copy)(path, target / path.name)
 
 
+def copy_decoder(folder):
+    copy_package(folder, ROOT / "codec" / "js")
+
+
 def install_decoder(folder):
-    """Install the package of the decoder from its packed form, without files that are not shipped."""
+    """Pack and install the decoder by the page's lines, without files that are not shipped."""
     npm = shutil.which("npm") or absent("the package of the decoder needs npm, which is not installed")
-    words, how = [npm, "--silent", "--offline", "--no-audit", "--no-fund"], {"cwd": folder, "text": True}
-    packed = subprocess.run([*words, "pack", ROOT / "codec" / "js"], check=True, capture_output=True, **how)
-    subprocess.run([*words, "install", f"./{packed.stdout.strip()}"], check=True, **how)
+    (folder / "codec").symlink_to(ROOT / "codec")
+    (lines,) = (block for block in samples("sh") if "npm pack" in block)
+    for line in lines.splitlines():
+        name, *words = shlex.split(line)
+        assert "npm" == name
+        subprocess.run([npm, *words, "--silent", "--offline", "--no-audit", "--no-fund"], check=True, cwd=folder)
 
 
 @pytest.mark.slow
@@ -124,10 +97,7 @@ def test_the_samples_in_javascript(provide, site, tmp_path, model):
     for text in samples("js"):
         (tmp_path / re.match(r"// (\w+\.mjs)\n", text)[1]).write_text(text, "utf-8")
     provide(tmp_path)
-    three = tmp_path / "node_modules" / "three"
-    three.mkdir()
-    (three / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
-    (three / "three.mjs").write_text(THREE)
+    shutil.copy(EXAMPLES / "splat_math.mjs", tmp_path)
     (tmp_path / "run.mjs").write_text(RUN)
     data = encode(model, replace(FAST, tile_splats=200))
     scene, count = decode(data), len(model)
@@ -138,14 +108,7 @@ def test_the_samples_in_javascript(provide, site, tmp_path, model):
     assert 0 == done.returncode, done.stderr
     assert {200, 206} == set(site.statuses("/scene.csplat"))
     given = json.loads(done.stdout)
-    assert (2, [3, 4]) == (given["workers"], given["sizes"])
-
-    np.testing.assert_array_equal(scene.means.ravel(), np.array(given["position"], np.float32))
-    colours = np.array(given["colour"]).reshape(count, 4)
-    np.testing.assert_array_equal(scene.opacities, colours[:, 3].astype(np.float32))
-    shown = np.maximum(0.0, 0.5 + 0.28209479 * scene.sh0.astype(np.float64))
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(linear, colours[:, :3], rtol=1e-4, atol=1e-6)
+    assert 2 == given["workers"]
     wanted = covariances(scene.quats, scene.scales)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     largest = np.exp(2.0 * scene.scales.astype(np.float64)).max(axis=1, keepdims=True)
     np.testing.assert_allclose(np.reshape(given["covariances"], (count, 6)) / largest, wanted / largest, atol=1e-6)
@@ -162,6 +125,40 @@ def test_the_samples_in_javascript(provide, site, tmp_path, model):
     assert count == sum(sizes.values())
     assert {1, 2, 3, 4} == {layer for _, layer, _ in given["bands"]}
     assert all(size == 3 * (2 * layer + 1) * sizes[first] for first, layer, size in given["bands"])
+
+
+GIVEN = """
+const drawn = [], [authorization, signal] = ['Bearer x', new AbortController().signal];
+const newSignedUrl = () => url, draw = ({ count }) => drawn.push(count);
+"""
+# What comes of the samples of a package's page.
+PACKAGES = {
+    "js": "[scene.count, band.count, packed.count, drawn, tiles, nodes.length, signed.header.splatCount]",
+    "js-encoder": "[file.length, edited.length, splats.opacities.length]",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PACKAGES)
+def test_the_samples_of_the_packages_run_in_order(name, site, tmp_path, model):
+    node = shutil.which("node") or absent("the samples in JavaScript need Node.js, which is not installed")
+    copy_package(tmp_path, ROOT / "codec" / name)
+    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=400)))
+    write_ply(tmp_path / "scene.ply", model)
+    file = "scene.csplat" if name == "js" else "scene.ply"
+    url = site.add(f"/{file}", (tmp_path / file).read_bytes())
+    page = "".join(samples("js", (ROOT / "codec" / name / "README.md").read_text("utf-8")))
+    program = f"const url = {url!r};\n{GIVEN}{page}console.log(JSON.stringify({PACKAGES[name]}));\nprocess.exit();\n"
+    (tmp_path / "page.mjs").write_text(program, "utf-8")
+    done = subprocess.run([node, "page.mjs"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 0 == done.returncode, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    if name == "js":
+        half = len(model) // 2
+        assert [len(model), half, half, [half] * 4, [0, 1], 1, len(model)] == told
+    else:
+        assert len(model) == told.pop()
+        assert min(told) > 5 * len(model)
 
 
 @pytest.mark.slow
@@ -194,12 +191,20 @@ def test_the_engine_without_a_page(tab, site, model):
     assert 0.1 < shown.mean() < 0.9
 
 
-def test_the_guide_contains_the_unchanged_examples():
-    examples = ROOT / "tools" / "examples"
-    for name in ("babylon", "playcanvas", "spark", "three"):
-        licence, _, sample = (examples / name).with_suffix(".mjs").read_text("utf-8").partition("\n")
-        assert "// SPDX-License-Identifier: Apache-2.0" == licence
-        assert f"```js\n{sample}```\n" in TEXT
+def test_the_guide_contains_lines_of_the_examples():
+    for heading, name in {
+        "three.js": "three",
+        "Spark": "spark",
+        "PlayCanvas": "playcanvas",
+        "Babylon.js": "babylon",
+    }.items():
+        _, _, example = (EXAMPLES / f"{name}.mjs").read_text("utf-8").partition("\n")  # after the licence
+        shown = re.search(rf"^### {heading}\n.*?^```(?:js|javascript)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)[1]
+        assert shown == example or name != "three"
+        lines = {line.strip() for line in example.splitlines()}
+        assert [] == [line for line in shown.splitlines() if line.strip() not in lines]
+    scripts = json.loads((EXAMPLES / "bundlers" / "package.json").read_text("utf-8"))["scripts"]
+    assert f"```sh\nnpx {scripts['playcanvas'].replace('dist/playcanvas/', '')}\n```\n" in TEXT
 
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
