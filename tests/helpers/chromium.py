@@ -3,6 +3,7 @@
 
 import base64
 import itertools
+import math
 import os
 import re
 import shutil
@@ -106,7 +107,7 @@ class ViewerPage(_ServedPage):
             self.page.keyboard.press("i")
         self.page.keyboard.press("Escape")
         self.site.requests.clear()
-        self.site.ranges, self.site.bytes_per_second = True, 0
+        self.site.ranges, self.site.bytes_per_second, self.site.bytes_left = True, 0, math.inf
 
     def _resize(self):
         if self.page.viewport_size != self.SIZE:
@@ -260,6 +261,7 @@ class Site:
         self.requests = []  # path and status of all that came, in order
         self.ranges = True  # False: ignore Range, and answer 200 with everything
         self.bytes_per_second = 0  # speed of each answer to a path that a test added; 0 for no limit
+        self.bytes_left = math.inf  # of answers to such paths, until they wait
         self.breaks = False  # True: connections break in the middle of a later part of such a path
         self.policy = ""  # Content-Security-Policy of all answers
         # By path: functions of a request's headers and number, from 1 on, that return an answer of their own or None.
@@ -331,9 +333,14 @@ class Site:
 
     def _send(self, handler, body, *, slow):
         step = max(1, self.bytes_per_second // 20) if slow and self.bytes_per_second else len(body) or 1
+        if slow and self.bytes_left < math.inf:
+            step = min(step, 1024)
         try:
             for start in range(0, len(body), step):
-                if step < len(body):
+                while slow and self.bytes_left <= 0:
+                    time.sleep(0.02)
+                self.bytes_left -= step if slow else 0
+                if slow and self.bytes_per_second:
                     time.sleep(0.05)
                 handler.wfile.write(body[start : start + step])
         except (BrokenPipeError, ConnectionResetError):

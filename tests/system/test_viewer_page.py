@@ -3,6 +3,7 @@
 
 import base64
 import json
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -230,12 +231,14 @@ def test_the_automatic_camera_sees_the_object_whatever_outliers_do(viewer, model
     assert 0.15 < (viewer.picture()[..., :3].max(axis=2) > 40).mean() < 0.9
 
 
-def test_the_camera_does_not_move_while_a_scene_loads(viewer, model):
-    viewer.site.bytes_per_second = 100_000
-    viewer.begin(encode(model, EncodeOptions(preset="fast", tile_splats=200)))
+def test_the_camera_does_not_move_while_a_scene_loads(viewer, sample_path):
+    data = encode(read_ply(sample_path), EncodeOptions(preset="fast", tile_splats=1000))
+    viewer.site.bytes_left = 100_000  # more than the first request
+    assert viewer.site.bytes_left < len(data)
+    viewer.begin(data)
     viewer.until("csplatViewer.engine?.bounds?.coarse")
     first = viewer.viewmat
-    viewer.site.bytes_per_second = 0
+    viewer.site.bytes_left = math.inf
     viewer.page.evaluate("shown")
     assert viewer.page.evaluate("!csplatViewer.engine.bounds.coarse")
     assert first == viewer.viewmat

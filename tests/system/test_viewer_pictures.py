@@ -168,7 +168,7 @@ def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(rema
     engine = remade(f"{{ backend: '{backend}', pixelError: 0 }}")
     model = decode(levels_file)
     engine.look(wide)
-    engine.site.bytes_per_second = 20_000
+    engine.site.bytes_left = len(levels_file) // 2
     url = engine.site.add("/scene.csplat", levels_file)
     try:
         engine.page.evaluate("(url) => void (window.opened = engine.open(url))", url)
@@ -176,7 +176,7 @@ def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(rema
         stats = engine.stats()
         early = engine.picture_of_now(wide)
     finally:
-        engine.site.bytes_per_second = 0
+        engine.site.bytes_left = math.inf
     assert stats["splatsResident"] < len(model)
     assert 0 < stats["firstPictureBytes"] < len(levels_file) / 2
     engine.page.evaluate("opened")
