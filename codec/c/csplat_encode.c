@@ -336,7 +336,9 @@
 enum { TILE = SPEC_TILE_SPLATS_MAX, DEGREE_MAX = SPEC_SH_DEGREE_MAX, LAYERS = DEGREE_MAX + 1 };
 enum { COEFFICIENTS_MAX = (DEGREE_MAX + 1) * (DEGREE_MAX + 1) - 1, VALUES_MAX = 3 * COEFFICIENTS_MAX };
 enum { BANDS_COLUMNS_MAX = 3 * (2 * DEGREE_MAX + 1) }; /* integers of the highest band */
-enum { BUCKET = 1 << 19 };   /* splats; a larger scene is planned on a sample of this size */
+enum { BUCKET = 1 << 19 };     /* splats; a larger scene is planned on a sample of this size */
+enum { TILES = 8 };            /* of a scene of medium size, so that viewers show the first one soon */
+enum { TILE_LEAST = 1 << 14 }; /* splats; least limit of a tile */
 enum { CHROMA_SHIFT = 1 };
 enum { ENTRIES_MAX = 255 };  /* of the SH codebook: with the escape, indices fit one byte */
 enum { CLIP = 511 };         /* lattice steps; splats with larger coefficients are escaped */
@@ -1083,6 +1085,13 @@ static int add_part(encoder *e, uint32_t start, uint32_t count, int exponent)
     return 1;
 }
 
+/* Return the maximum number of splats per tile (coding_parameters.py). */
+static uint32_t tile_limit(const encoder *e)
+{
+    uint32_t share = e->in->count / TILES + (e->in->count % TILES != 0);
+    return share < TILE_LEAST ? TILE_LEAST : share > TILE ? TILE : share;
+}
+
 /* Return log2 rounded up, or a number below that of every double. */
 static int exponent_of(double ratio)
 {
@@ -1095,7 +1104,7 @@ static uint32_t halve(encoder *e, span whole, int axis, double low, double exten
     uint32_t *rows = e->order + whole.start, near = 0, far = 0, *apart = (uint32_t *)spare, same = 0;
     double limit = low + extent / 2.0;
     if (items) { /* at a quantile that lets tiles of both halves be about equally full */
-        uint32_t tiles = whole.count / TILE + (whole.count % TILE != 0);
+        uint32_t most = tile_limit(e), tiles = whole.count / most + (whole.count % most != 0);
         uint32_t share = (uint32_t)((uint64_t)whole.count * (tiles / 2) / tiles);
         for (uint32_t i = 0; i < whole.count; i++) {
             items[i].row = rows[i];
@@ -1146,7 +1155,7 @@ static int cut_tiles(encoder *e, span whole, item *items, item *spare)
         }
         extent = high[axis] - low[axis];
         int is_wide = extent / e->p.means > (double)((1 << BITS) - 1) && current.count > OWN_TILE_MIN;
-        if (!is_wide && current.count <= TILE) {
+        if (!is_wide && current.count <= tile_limit(e)) {
             int needed = exponent_of(extent / e->p.means / ((1 << BITS) - 2));
             int finest = exponent_of(reach / e->p.means / 0x1p45); /* float resolves 2^24 */
             int exponent = needed > finest ? needed : finest;

@@ -247,7 +247,8 @@ def test_bytes_do_not_depend_on_threads(make_model):
 
 OUT_OF_RANGE = (
     ("preset", "tiny"), ("position_bits", 17), ("position_bits", 8.5), ("sh_degree", 5), ("quat_levels", 2),
-    ("deflate_level", 0), ("scale_step", 0), ("scale_step", math.nan), ("sh_step", "0.1"), ("tile_splats", None),
+    ("deflate_level", 0), ("scale_step", 0), ("scale_step", math.nan), ("sh_step", "0.1"),
+    ("tile_splats", 0), ("bucket_splats", None),
 )  # fmt: skip
 
 

@@ -141,6 +141,14 @@ def test_writes_the_same_integers_for_extreme_values(library, sample):
     assert_like_python(library, few.select(np.zeros(5000, np.intp)))
 
 
+def test_cuts_the_same_tiles(library, sample):
+    rng, few = np.random.default_rng(3), replace(sample, shN=sample.shN[:, :3])
+    for count in (40_000, 140_000):  # of the smallest limit, and of an eighth of the splats
+        model = few.select(rng.integers(0, len(few), count))
+        moved = model.means + rng.normal(0.0, 0.3, model.means.shape).astype(np.float32)
+        assert_like_python(library, replace(model, means=moved))
+
+
 @in_depth
 def test_writes_the_same_integers_for_a_scene_of_several_buckets(library, sample):
     count = BUCKET_SPLATS + 20000

@@ -41,11 +41,13 @@ class SceneSurvey:
 
     Attributes:
         sample: the splats `sample_rows` of the scene.
+        count: number of splats of the scene.
         largest_sh: largest magnitude of the SH coefficients of all splats.
         contrast: contrast of the scene, see `contrast_of`.
     """
 
     sample: SplatModel
+    count: int
     largest_sh: float
     contrast: float
 
@@ -89,7 +91,7 @@ class MemoryBuckets:
             sums = pool.map(lambda rows: contrast_sums(plain.select(rows)), contrast_buckets(self.rows))
             largest = pool.map(largest_sh, np.array_split(self.model.shN, len(self.rows)))
             sample = pool.submit(self.model.select, sample_rows(len(self.model), self.bucket_splats))
-            return SceneSurvey(sample.result(), max(largest), contrast_of(sums))
+            return SceneSurvey(sample.result(), len(self.model), max(largest), contrast_of(sums))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,9 @@ from csplat.types import F32, F64
 #: Largest displacement of a mean by rounding, in steps.
 HALF_DIAGONAL = 3.0**0.5 / 2.0
 
+# Viewers show the first picture when layer 0 of a tile is here: after a tenth of the file, if there are eight of them.
+_TILES = 8
+_TILE_RANGE = (1 << 14, _spec.TILE_SPLATS_MAX)  # splats per tile; at the least, files are up to 1 % larger
 _EXTENT_SAMPLE = 1 << 16  # splats on which the extent is estimated
 _EDGE = 0.02  # fraction of the splats outside the extent on either side of an axis
 _BITS_MAX = 16  # bits per axis of a tile
@@ -200,11 +203,16 @@ def choose_parameters(
         sh_degree=degree,
         sh_coding=sh_coding if degree else "none",
         adaptive=_default_to(options.adaptive, preset.adaptive if importance_given else 0.0),
-        tile_splats=options.tile_splats,
+        tile_splats=tile_limit(len(model), options),
         deflate=DeflateSettings(
             level=_default_to(options.deflate_level, preset.deflate_level), library=deflate_library(options.deflate)
         ),
     )
+
+
+def tile_limit(count: int, options: EncodeOptions) -> int:
+    """Return the maximum number of splats per tile, 1 to 65536, of a scene of `count` splats."""
+    return options.tile_splats or int(np.clip(math.ceil(count / _TILES), *_TILE_RANGE))
 
 
 def band_slice(band: int) -> slice:

@@ -55,9 +55,9 @@ class EncodeOptions:
             proportional to importance). Default: 0 without an importance.
         max_classes: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share
             steps. Requires an importance with Gauss-Newton blocks. Default: one per 2,500 splats; 1 with "fast".
-        tile_splats: maximum number of splats per tile, 1 to 65536. Decoders distribute tiles over cores: with 16384,
-            scenes of few tiles decode 1.2 to 3.6 times as fast on four cores and take up to 1.2 % more bytes; 4096
-            takes 3 to 6 % more.
+        tile_splats: maximum number of splats per tile, 1 to 65536. Viewers show each tile as it arrives, and decoders
+            distribute tiles over cores; 16384 takes up to 1.2 % more bytes than 65536, 4096 takes 3 to 6 % more.
+            Default: an eighth of the splats, at least 16384; 65536 for quantisation classes and for targets.
         bucket_splats: maximum number of splats of a bucket. Larger scenes are planned on a sample of that size, and
             encoded bucket by bucket. A smaller number takes less memory and leads to worse steps and codebooks.
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
@@ -96,7 +96,7 @@ class EncodeOptions:
     shape_escape_fraction: float | None = None
     adaptive: float | None = None
     max_classes: int | None = None
-    tile_splats: int = _spec.TILE_SPLATS_MAX
+    tile_splats: int | None = None
     bucket_splats: int = BUCKET_SPLATS
     deflate_level: int | None = None
     deflate: Deflate = "auto"
@@ -198,7 +198,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "bucket_splats": (int, 100, math.inf),
     "deflate_level": (int, 1, 12),
 }
-_NEVER_NONE = ("tile_splats", "bucket_splats")
+_NEVER_NONE = ("bucket_splats",)
 
 
 def _number(value: Any, kind: type[int | float]) -> int | float | None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.buckets import BucketStore, MemoryBuckets, bucket_rows
-from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
+from csplat.encoder.coding_parameters import CodingParameters, choose_parameters, tile_limit
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
@@ -142,6 +142,8 @@ class EncodePlan:
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
         parameters, classes = choose_classes(model, blocks, parameters, options)
+        if classes is not None and options.tile_splats is None:  # has tiles for each class already
+            parameters = replace(parameters, tile_splats=_spec.TILE_SPLATS_MAX)
         buckets = bucket_rows(model.means, options.bucket_splats) if classes is None else None
         tiles = cut_scene(model, parameters, classes, buckets)
         shapes = None
@@ -178,7 +180,9 @@ class EncodePlan:
         """
         survey = store.survey()
         sample = cls.of(survey.sample, options, contrast=survey.contrast, context=context)
-        sample = replace(sample, parameters=final_parameters(sample.parameters, survey.largest_sh))
+        parameters = final_parameters(sample.parameters, survey.largest_sh)
+        parameters = replace(parameters, tile_splats=tile_limit(survey.count, options))
+        sample = replace(sample, parameters=parameters)
         tiles = cut_scene(store.model, sample.parameters, buckets=store.rows)
         return replace(sample, model=store.model, origin=origin, tiles=tiles, sample=sample, buckets=store.rows)
 

@@ -145,8 +145,9 @@ class DiskBuckets:
             InputError: the file with the sample is damaged.
             OSError: it cannot be read.
         """
-        count = len(sample_rows(sum(self.counts), self.bucket_splats))
-        return SceneSurvey(_read_range(self.folder / _SAMPLE, self.model, 0, count), self.largest_sh, self.contrast)
+        count = sum(self.counts)
+        sample = _read_range(self.folder / _SAMPLE, self.model, 0, len(sample_rows(count, self.bucket_splats)))
+        return SceneSurvey(sample, count, self.largest_sh, self.contrast)
 
     def remove_section(self, section: int) -> None:
         """Remove a spill file whose buckets are coded."""

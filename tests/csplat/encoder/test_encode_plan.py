@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import measure_errors
+from quantisation_cases import COUNT, important
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import decode_scene, read_options
 from csplat.encode_api import encode_planned, encode_with_report
 from csplat.encoder import EncodePlan, Origin, encode_tiles
+from csplat.encoder.coding_parameters import tile_limit
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file
@@ -36,6 +38,23 @@ def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, option
         assert getattr(decoded, name).tobytes() == getattr(plan.scene, name)[result.source_index].tobytes(), name
     for name in COLOURS:
         assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
+
+
+def test_tiles_have_an_eighth_of_the_splats_within_limits(make_model):
+    for count, most in ((0, 16384), (131_072, 16384), (131_073, 16385), (289_444, 36181), (600_000, 65536)):
+        assert most == tile_limit(count, EncodeOptions())
+        assert 100 == tile_limit(count, EncodeOptions(tile_splats=100))
+    model = make_model(40_000, 0)
+    assert [13333, 13333, 13334] == sorted(len(tile.rows) for tile in EncodePlan.of(model).tiles)
+    assert 1 == len(EncodePlan.of(model.select(slice(0, 16384))).tiles)
+
+
+def test_the_tiles_of_classes_are_cut_only_if_they_are_full(make_model):
+    model = make_model(COUNT, 0)
+    for options, most in ((EncodeOptions(), 65536), (EncodeOptions(tile_splats=400), 400)):
+        plan = EncodePlan.of(model, options, importance=important(model))
+        assert plan.classes is not None
+        assert most == plan.parameters.tile_splats
 
 
 def test_an_origin_of_other_splats_is_refused(make_model):

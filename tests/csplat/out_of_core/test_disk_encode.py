@@ -191,6 +191,14 @@ def test_options_give_the_bytes_of_memory(model, options, tmp_path):
 
 
 @pytest.mark.slow
+def test_tiles_are_as_large_as_the_whole_scene_requires(make_model, tmp_path):
+    model, options = make_model(200_000, 0), EncodeOptions(preset="fast", bucket_splats=50_000)
+    report = encode_large(Scene.of(model), tmp_path / "out.csplat", options)
+    assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
+    assert 10 == report.tile_count  # buckets of 40,000, of two tiles each; those of the sample have at most 16,384
+
+
+@pytest.mark.slow
 def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     origin = (4.5e5, 5.4e6, 100.0)
     doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9

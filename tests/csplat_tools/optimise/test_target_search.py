@@ -9,6 +9,7 @@ from analytic_search import AnalyticScene, Views, search
 from tables import failures
 
 from csplat import EncodeOptions, InputError
+from csplat_tools.optimise.candidates import Coding
 
 PLAIN = AnalyticScene()
 UNNEEDED = AnalyticScene(unneeded=4000)
@@ -270,3 +271,8 @@ def test_the_report_lists_every_candidate():
     assert report.psnr == pytest.approx(found.file.psnr())
     assert report.chosen in report.tried
     assert any(line.startswith("tried for these splats, too") for line in report.why)
+
+
+def test_files_of_a_search_have_full_tiles():
+    tiles = {EncodeOptions(): 65536, EncodeOptions(tile_splats=100): 100}
+    assert tiles == {options: Coding().options(options, 40_000, None).tile_splats for options in tiles}
