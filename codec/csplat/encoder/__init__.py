@@ -10,9 +10,8 @@ Names are imported on first use (PEP 562): commands that do not encode load only
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
-
-from csplat import lazy_exports
 
 if TYPE_CHECKING:
     from csplat.encoder.buckets import bucket_rows, sample_rows
@@ -119,4 +118,12 @@ _MODULE_OF = {
     "project_sh": "csplat.encoder.splat_importance",
     "sample_rows": "csplat.encoder.buckets",
 }
-__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name; not by `csplat.lazy_exports`, since the encoder knows nothing of what `csplat` offers."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(import_module(_MODULE_OF[name]), name)
+    globals()[name] = value  # later accesses bypass this function
+    return value
