@@ -104,5 +104,11 @@ def readme_of_the_package(project):
 
 def test_the_readme_of_the_package_needs_no_checkout():
     shown = readme_of_the_package(tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8")))
-    assert 'pip install "csplat[render]"' in shown
+    for words in (
+        'pip install "csplat[render]"',
+        "PLY files are read with plyfile",
+        "csplat encode scene.ply",
+        "## Licence",
+    ):
+        assert words in shown
     assert [] == re.findall(r"!\[|\]\((?!https://)|not on PyPI|make demo", shown)
