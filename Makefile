@@ -79,12 +79,12 @@ docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(BIN)/python tools/docs/make_site.py
 	@echo "open out/site/index.html"
 
-dist: $(VENV)/.dev ## sdist, wheels with and without the library, npm package in out/; a release gives TAG and URL, for metadata
+dist: $(VENV)/.dev ## sdist, wheels with and without the library, npm packages in out/; a release gives TAG and URL, for metadata
 	rm -rf out/dist out/npm && mkdir -p out/npm
 	$(if $(URL),$(BIN)/python tools/release/prepare.py --tag "$(TAG)" --url "$(URL)")
 	CSPLAT_NATIVE=off $(BIN)/python -m build --no-isolation --outdir out/dist .
 	$(if $(filter off,$(CSPLAT_NATIVE)),,CSPLAT_NATIVE=require $(BIN)/python -m build --wheel --no-isolation --outdir out/dist .)
-	cd codec/js && npm pack --silent --pack-destination ../../out/npm
+	npm pack --silent --pack-destination out/npm ./codec/js ./codec/js-encoder
 
 test-dist: FRESH := out/fresh/$(notdir $(BIN))
 test-dist: ## install the wheel that pip chooses of out/dist in an environment of its own; run the commands of `make demo` and `compare`

@@ -46,10 +46,10 @@ def __getattr__(name: str) -> Any:
     Raises:
         InputError: the package that has it, or one that it requires, is not installed.
     """
+    if name.startswith("_"):  # each import of this module asks for `__path__`
+        raise AttributeError(name)
     for point in _entry_points("csplat.functions").select(name=name):
         return point.load()
-    if name.startswith("_"):
-        raise AttributeError(name)
     raise InputError(f"csplat.{name} is not installed: csplat has to be installed as a whole")
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import mmap
-import multiprocessing
 import os
 import shlex
 import signal
@@ -17,8 +16,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -260,6 +257,10 @@ def map_in_processes(
         for item in items:
             yield item, work(shared, item)
         return
+    import multiprocessing  # with its queues 20 ms of every start; hardly any command has worker processes
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures.process import BrokenProcessPool
+
     start = "forkserver" if CAN_FORK else "spawn"
     workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin_worker, (work, shared))

@@ -272,7 +272,10 @@ def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
         r"(torch|csplat_trainer|csplat_tools|plyfile)(\..*)?"),
     ("from csplat_tools.cli.app import app; app(['encode', 'scene.ply', 'o.csplat'], standalone_mode=False)",
         r"rich|csplat_tools\.cli\.(info|train)"),
-], ids=["csplat", "packages", "decoder", "reader", "renderer", "program"])  # fmt: skip
+    ("from csplat_tools.cli.app import app; app(['info', 'scene.csplat'], standalone_mode=False)",
+        r"rich|PIL|multiprocessing|csplat\.(encode_api|out_of_core|encoder\.(?!encode_options|target).*)"),
+    ("import csplat.model", r"importlib\.metadata|csplat\.encoder"),
+], ids=["csplat", "packages", "decoder", "reader", "renderer", "program", "description", "model"])  # fmt: skip
 def test_an_import_loads_no_other_part(files, statement, unwanted):
     words = [sys.executable, "-c", f"{statement}\nimport sys\nprint(*sorted(sys.modules))"]
     done = subprocess.run(words, cwd=files[1].parent, capture_output=True, text=True, check=True)

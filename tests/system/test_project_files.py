@@ -68,7 +68,9 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
     def prepared(tag, url):
         return runpy.run_path(ROOT / "tools" / "release" / "prepare.py")["main"](["--tag", tag, "--url", url], tmp_path)
 
-    for name in ("pyproject.toml", "codec/js/package.json", "codec/csplat/__init__.py"):
+    packages = ("codec/js", "codec/js-encoder")
+    names = (f"{folder}/package.json" for folder in packages)
+    for name in ("pyproject.toml", "codec/csplat/__init__.py", *names):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     project = tmp_path / "pyproject.toml"
@@ -81,6 +83,32 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
         assert 0 == prepared(f"v{csplat.__version__}", url)
         after = tomllib.loads(project.read_text("utf-8"))
         assert url == after["project"].pop("urls")["Homepage"]
+        shown = readme_of_the_package(after)
+        assert f"]({url}/blob/v{csplat.__version__}/spec/format.md)" in shown
+        assert [] == re.findall(r"\]\((?!https://)[^)]*\)", shown)
+        after["tool"]["hatch"]["metadata"] = before["tool"]["hatch"]["metadata"]
         assert before == after
-        package = json.loads((tmp_path / "codec" / "js" / "package.json").read_text("utf-8"))
-        assert {"type": "git", "url": f"git+{url}.git", "directory": "codec/js"} == package["repository"]
+        for folder in packages:
+            package = json.loads((tmp_path / folder / "package.json").read_text("utf-8"))
+            assert {"type": "git", "url": f"git+{url}.git", "directory": folder} == package["repository"]
+
+
+def readme_of_the_package(project):
+    """Return README.md as the metadata of the package have it."""
+    text = (ROOT / "README.md").read_text("utf-8")
+    for one in project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
+        text, count = re.subn(one["pattern"], one["replacement"], text)
+        assert count, one
+    return text
+
+
+def test_the_readme_of_the_package_needs_no_checkout():
+    shown = readme_of_the_package(tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8")))
+    for words in (
+        'pip install "csplat[render]"',
+        "PLY files are read with plyfile",
+        "csplat encode scene.ply",
+        "## Licence",
+    ):
+        assert words in shown
+    assert [] == re.findall(r"!\[|\]\((?!https://)|not on PyPI|make demo", shown)

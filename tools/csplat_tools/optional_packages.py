@@ -8,7 +8,6 @@ import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +154,8 @@ def processor_name() -> str:
 
 def package_version(name: str) -> str:
     """Return the version of an installed package, or `absent`."""
+    from importlib.metadata import PackageNotFoundError, version  # 20 ms, for reports and errors alone
+
     try:
         return version(name)
     except PackageNotFoundError:

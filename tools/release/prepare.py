@@ -16,28 +16,31 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+_PACKAGES = ("codec/js", "codec/js-encoder")  # of npm
 
 
 def main(words: list[str] | None = None, root: Path = ROOT) -> int:
-    """Change pyproject.toml and codec/js/package.json in place; the status is 1 for a tag of another version."""
+    """Change pyproject.toml and both package.json in place; the status is 1 for a tag of another version."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tag", required=True, help="`v` and the version")
     parser.add_argument("--url", required=True, help="of the repository, https")
     args = parser.parse_args(words)
     if not re.fullmatch(r"https://[\w.-]+(/[\w.-]+)+", args.url):
         parser.error(f"--url is {args.url!r}, expected https://HOST/OWNER/NAME")
-    project, package = root / "pyproject.toml", root / "codec" / "js" / "package.json"
+    project = root / "pyproject.toml"
     text = project.read_text("utf-8")
     version = re.findall(r'(?m)^__version__ = "(.+)"$', (root / "codec/csplat/__init__.py").read_text("utf-8"))[0]
     if args.tag != f"v{version}":
         sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, as codec/csplat/__init__.py states\n")
         return 1
-    project.write_text(with_urls(text, args.url), "utf-8", newline="\n")
-    metadata = json.loads(package.read_text("utf-8")) | {
-        "homepage": args.url,
-        "repository": {"type": "git", "url": f"git+{args.url}.git", "directory": "codec/js"},
-    }
-    package.write_text(json.dumps(metadata, indent=2, ensure_ascii=False) + "\n", "utf-8", newline="\n")
+    project.write_text(with_links(with_urls(text, args.url), f"{args.url}/blob/{args.tag}"), "utf-8", newline="\n")
+    for folder in _PACKAGES:
+        package = root / folder / "package.json"
+        metadata = json.loads(package.read_text("utf-8")) | {
+            "homepage": args.url,
+            "repository": {"type": "git", "url": f"git+{args.url}.git", "directory": folder},
+        }
+        package.write_text(json.dumps(metadata, indent=2, ensure_ascii=False) + "\n", "utf-8", newline="\n")
     return 0
 
 
@@ -57,6 +60,18 @@ def with_urls(text: str, url: str) -> str:
     text = re.sub(r"(?ms)^\[project\.urls\]\n.*?(?=^\[)", "", text)
     changed, count = re.subn(r"(?m)^(?=\[project\.optional-dependencies\]$)", lambda _: table, text)
     assert count == 1, "pyproject.toml has no [project.optional-dependencies] to stand before"
+    return changed
+
+
+def with_links(text: str, base: str) -> str:
+    """Return a pyproject.toml by which relative links of the README, as a package index shows it, lead to a repository.
+
+    Args:
+        text: the file.
+        base: address of the files of the release.
+    """
+    changed, count = re.subn(r"(?<=replacement = )'[^']*'", lambda _: rf"'[\1]({base}/\2)'", text)
+    assert count == 1, "pyproject.toml has no substitution for the links of the README"
     return changed
 
 

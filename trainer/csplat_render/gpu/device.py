@@ -306,8 +306,8 @@ def open_device(*, software: bool = False, binding_max: int | None = None) -> De
     adapters.sort(key=lambda adapter: _KINDS.index(_describe(adapter).kind))
     usable = [adapter for adapter in adapters if _describe(adapter).is_hardware is not software]
     if not usable:
-        names = ", ".join(str(_describe(adapter)) for adapter in adapters) or "no adapter"
-        raise InputError(f"no {'software adapter' if software else 'GPU'} was found, only {names}")
+        names = ", ".join(str(_describe(adapter)) for adapter in adapters)
+        raise InputError(f"no {'software adapter' if software else 'GPU'} was found{names and f', only {names}'}")
     return Device(wgpu, usable[0], binding_max)
 
 
