@@ -67,19 +67,22 @@ def test_a_backdrop_covers_as_much_as_the_scene_and_does_not_stand_for_the_part(
     assert 0 < np.count_nonzero(inside) < len(backdrop)
 
 
-def test_every_other_view_of_a_coarse_level_of_surroundings_is_farther_away(sample):
+def test_every_other_view_of_a_coarse_level_of_a_whole_scene_is_farther_away(sample):
     ball = sample.select(slice(0, 500))
     apart = np.where(np.arange(500) % 3, 1.0, 40.0)[:, None]  # a third of the splats is all around the others
     room = replace(ball, means=(ball.means * apart).astype(np.float32), means_double=None)
+    assert ["surrounding", "object"] == [scene_frame(room).kind, scene_frame(ball).kind]
     fitter = LevelFitter(room, work=Work(0.0, (8, 8), 0.0, (5, 5)))
-    frame = scene_frame(room)
-    assert ["surrounding", "object"] == [frame.kind, scene_frame(ball).kind]
-    near, far = (
-        [np.linalg.norm(camera.position - frame.centre) for camera in fitter._views(level)] for level in (1, 3)
-    )  # fmt: skip
-    np.testing.assert_allclose(np.tile([1.0, 4.0], len(near) // 2), np.divide(far, near))
-    for inside in (replace(fitter, scene=ball), replace(fitter, backdrop=make_backdrop(room, len(room)))):
-        assert inside._views(1) is inside._views(3)
+    for scene, times in (room, 4.0), (ball, 2.0):
+        whole = replace(fitter, scene=scene)
+        near, far = (
+            [np.linalg.norm(camera.position - scene_frame(scene).centre) for camera in whole._views(level)]
+            for level in (1, 3)
+        )  # fmt: skip
+        np.testing.assert_allclose(np.tile([1.0, times], len(near) // 2), np.divide(far, near))
+    assert whole._views(1) is whole._views(2)
+    part = replace(fitter, backdrop=make_backdrop(room, len(room)))
+    assert part._views(1) is part._views(3)
 
 
 class Crowded(LevelFitter):

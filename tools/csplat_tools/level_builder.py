@@ -3,9 +3,10 @@
 
 Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent. Above the node that all
 leaves have in common, a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the
-next finer level: the splats that matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by
-bucket from merged neighbours, until each bucket is one node. These nodes together are the scene whose levels are built
-next, as those of a small scene. If a scene has levels already, in streamed SOG, these are taken instead.
+next finer level, and the root has as many as it may: the splats that matter most, fitted to renders
+(`level_fitting.py`). Larger scenes are built bucket by bucket from merged neighbours, until each bucket is one node.
+These nodes together are the scene whose levels are built next, as those of a small scene. If a scene has levels
+already, in streamed SOG, these are taken instead.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class FittedLevelBuilder:
         count: number of levels above 0; `None`: until one node has `root_splats`.
         leaf_splats: maximum number of splats of a leaf; smaller leaves take more bytes, also of the index, which comes
             before the first picture, and larger leaves load later when they are seen.
-        root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
+        root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 25 kB.
         whole_splats: number of splats up to which a scene is built in one piece, with more work and a better level 1.
         fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
             scenes, neighbours are only merged. On two cores, 10 million splats of SH degree 3 take 9 minutes with the
@@ -269,7 +270,8 @@ class FittedLevelBuilder:
                 index = start - node_count + child
                 nodes[index] = replace(nodes[index], parent=start + child // _CHILDREN)
             node_count, places = math.ceil(node_count / _CHILDREN), places // _CHILDREN
-            count = max(node_count, math.ceil(len(splats) / _KEPT))
+            least = min(self.root_splats, len(splats) // 2) if last is None else 0  # of the root: it is seen first
+            count = max(node_count, math.ceil(len(splats) / _KEPT), least)
             places, splats = fit(splats, places, count, level - first)
             nodes += [LevelNode(level, None, splats=splats.select(rows)) for rows in _rows_by_node(places, node_count)]
         return nodes
