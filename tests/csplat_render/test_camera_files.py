@@ -32,6 +32,8 @@ def test_saved_cameras_are_loaded_exactly_and_near_and_image_may_be_left_out(tmp
     for further in ({}, {"background": [1.0, 1.0, 1.0]}):  # unknown keys are ignored
         (bare,) = load_cameras(written(tmp_path, [least | further]))
         assert (0.2, None) == (bare.near, bare.image)
+    (alone,) = load_cameras(written(tmp_path, least))  # as the element's `camera` gives it
+    assert bare.to_json() == alone.to_json()
 
 
 def test_cameras_relative_to_the_origin_or_to_0_are_distinguished(tmp_path):

@@ -325,7 +325,7 @@ def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
 
 
 def _parse_own_cameras(entries: object, path: Path) -> list[Camera]:
-    """Parse a list of cameras in csplat's own form.
+    """Parse a list of cameras in csplat's own form, or a single one.
 
     Args:
         entries: contents of a JSON file.
@@ -339,6 +339,8 @@ def _parse_own_cameras(entries: object, path: Path) -> list[Camera]:
     hints = [hint for fields, hint in _UNREAD if fields <= keys]
     if hints and not {"K", "viewmat"} <= keys:  # cameras may have further keys
         raise InputError(f"{path} {hints[0]}")
+    if {"K", "viewmat"} <= keys and isinstance(entries, Mapping):  # one camera, as viewers give it
+        entries = [entries]
     if not isinstance(entries, list) or not entries:
         raise InputError(
             f"{path} is not a camera file, expected a list of {{K, viewmat, W, H}}, cameras.json of INRIA, a camera "
