@@ -143,7 +143,7 @@ def test_writes_the_same_integers_for_extreme_values(library, sample):
 
 def test_cuts_the_same_tiles(library, sample):
     rng, few = np.random.default_rng(3), replace(sample, shN=sample.shN[:, :3])
-    for count in (40_000, 140_000):  # of the smallest limit, and of an eighth of the splats
+    for count in (40_000, 140_000):  # the least limit of a tile holds, and an eighth of the splats
         model = few.select(rng.integers(0, len(few), count))
         moved = model.means + rng.normal(0.0, 0.3, model.means.shape).astype(np.float32)
         assert_like_python(library, replace(model, means=moved))

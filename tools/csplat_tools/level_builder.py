@@ -270,7 +270,7 @@ class FittedLevelBuilder:
                 index = start - node_count + child
                 nodes[index] = replace(nodes[index], parent=start + child // _CHILDREN)
             node_count, places = math.ceil(node_count / _CHILDREN), places // _CHILDREN
-            least = min(self.root_splats, len(splats) // 2) if last is None else 0  # of the root: it is seen first
+            least = min(self.root_splats, len(splats) // 2) if last is None else 0  # a full root: it is seen first
             count = max(node_count, math.ceil(len(splats) / _KEPT), least)
             places, splats = fit(splats, places, count, level - first)
             nodes += [LevelNode(level, None, splats=splats.select(rows)) for rows in _rows_by_node(places, node_count)]

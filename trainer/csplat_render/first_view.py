@@ -46,7 +46,7 @@ _WALL_CELLS = 6  # per side of a wall
 _WALL_COVER = 0.9  # minimum fraction of a wall's cells with points
 _WALLS = 3  # minimum number of closed sides of a room, of four
 _INNER = 0.15  # maximum fraction of a room's points that are in the inner half of its box along each axis
-_BOX_QUANTILES = (0.01, 0.99)  # of a room's points along each axis
+_BOX_QUANTILES = (0.01, 0.99)  # quantiles of a room's points, per axis, that bound its box
 _TINY = 1e-9  # avoids divisions by 0
 _DIGITS = 6  # significant digits of the values in files; hides rounding, which differs between machines
 

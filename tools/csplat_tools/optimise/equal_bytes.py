@@ -8,6 +8,7 @@ for our own files. They are written, read again, and rendered by the same render
 from __future__ import annotations
 
 import itertools
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from csplat.editing.transform import DEFAULT_AXES, convert_axes
 from csplat.encoder import Target
 from csplat.errors import InputError, counted
 from csplat.formats import write
+from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.scene_metadata import UNSPECIFIED
@@ -92,22 +94,25 @@ def equal_bytes_page(source: Scene, other: Scene, views: ViewSet, name: str, con
 
 def _pruned(model: SplatModel, suffix: str, most_bytes: int, context: Context) -> tuple[int, SplatModel]:
     """Return the size of a file of most splats within some bytes, pruned and refitted, and what is read from it."""
-    count, best = len(model), None
+    goal, most, near = math.log(most_bytes), math.log(len(model)), -math.log(_NEAR)
+    best: tuple[int, SplatModel] | None = None
+    measured: list[tuple[float, float]] = []
+    value: float | None = most
     with tempfile.TemporaryDirectory(prefix="csplat-equal-") as folder:
         path = Path(folder) / f"scene.{suffix}"
-        for _ in range(_TRIES):
+        while value is not None:
             kept = model
-            if count < len(model):
-                kept = simplify(model, Target(keep=count / len(model)), context=context).model
+            if value < most:
+                kept = simplify(model, Target(keep=math.exp(value - most)), context=context).model
             write(path, kept)
             size = path.stat().st_size
-            if size <= most_bytes:
+            measured.append((value, math.log(size)))
+            if size <= most_bytes and (best is None or size > best[0]):
                 best = size, convert_axes(load_scene(str(path)), model.metadata.coordinate_system).model()
-                if size >= _NEAR * most_bytes or len(kept) == len(model):
-                    break
-            count = min(int(count * most_bytes / size * (1.0 if size < most_bytes else 0.995)), len(model))
-            if count < 1:
-                break
+            value = next_value(
+                goal, measured, 1.0, bounds=(0.0, most), margin=near / 2, tolerance=near,
+                least_step=1.0 / len(model), tries=_TRIES,
+            )  # fmt: skip
     if best is None:
         raise InputError(f"a {suffix.upper()} of {most_bytes:,} bytes has no room for splats of this scene")
     return best
