@@ -19,7 +19,10 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import csplat
+from csplat import EncodeOptions, encode
 from csplat_bench.pages import with_tables, write_pages
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import save_cameras
 from csplat_tools import batch
 from csplat_tools.cli.app import app
 
@@ -27,6 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "tools" / "docs"
 README = (ROOT / "README.md").read_text("utf-8")
 MEASURED = json.loads((DOCS / "measured.json").read_text("utf-8"))
+EQUAL = re.compile(r"<li><b>(\S+): ([\d.]+) dB</b><br>([\d.]+) kB, ([\d,]+) splats</li>")
 PRESETS = {row["name"]: row for row in MEASURED["rows"] if row["series"] == "preset"}
 
 
@@ -197,6 +201,33 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     assert 30.0 < names["compared"].psnr < names["compared"].ratio * 3
     assert len(names["coarse"]) < 4000
     assert {"small.csplat", "target.csplat"} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.slow
+def test_formats_are_shown_at_equal_bytes(tmp_path, monkeypatch, sample_path):
+    """With few splats, small images, and cameras on three sides."""
+    monkeypatch.syspath_prepend(DOCS)
+    model = csplat.read(sample_path).select(slice(0, None, 12))
+    csplat.write_ply(tmp_path / "scene.ply", model)
+    (tmp_path / "scene.csplat").write_bytes(encode(model, EncodeOptions(preset="fast")))
+    K, centre = intrinsics(64, 48, 60.0), tuple(np.median(model.means, axis=0))
+    places = (0.0, -1.0, -4.0), (4.0, -1.0, 0.0), (0.0, -1.0, 4.0)
+    save_cameras(tmp_path / "cameras.json", [look_at(at, centre, (0.0, -1.0, 0.0), K, 64, 48) for at in places])
+    names = [str(tmp_path / name) for name in ("scene.ply", "scene.csplat", "page.html")]
+    monkeypatch.setattr("sys.argv", ["equal_bytes.py", *names, "--cameras", str(tmp_path / "cameras.json")])
+    importlib.import_module("equal_bytes").main()
+    found = {
+        title: (float(psnr), float(size), int(splats.replace(",", "")))
+        for title, psnr, size, splats in EQUAL.findall((tmp_path / "page.html").read_text("utf-8"))
+    }
+    assert ["PLY", "SPZ", ".csplat"] == list(found)
+    csplat_psnr, csplat_size, count = found[".csplat"]
+    assert count == len(model)
+    for title, more in (("PLY", 1), ("SPZ", 3)):
+        psnr, size, splats = found[title]
+        assert 0.95 * csplat_size < size <= csplat_size + 0.1
+        assert 10.0 < psnr < csplat_psnr
+        assert more * 40 < splats < count
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ Also: csplat_render.scorer, csplat_tools.cli.compare.
 """
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +21,9 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import ReferenceImage, Scorer
-from csplat_tools.inspect.comparison import attribute_errors
+from csplat_tools.inspect.comparison import attribute_errors, compare
 from csplat_tools.scene_files import load_scene
-from csplat_tools.views import comparison_cameras
+from csplat_tools.views import comparison_cameras, find_view_set
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +147,15 @@ def test_json_has_psnr_at_the_top_and_renders_are_written_side_by_side(scene, ca
     with Image.open(tmp_path / "out" / "side.png") as picture:
         assert (3 * 64, 48) == picture.size
     assert "--force replaces it" in call(*words, *pictures, status=1).stderr
+
+
+def test_a_page_shows_source_file_and_difference_of_each_view(scene, camera_file, tmp_path):
+    (tmp_path / "b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
+    views = find_view_set(scene, cameras=str(camera_file), count=0)
+    page = tmp_path / "page.html"
+    compared = compare(scene, str(tmp_path / "b.csplat"), views=views, pictures=page)
+    text = page.read_text("utf-8")
+    assert (9, 6) == (text.count("<img "), text.count('role="slider"'))
+    assert [f"file, {one.psnr:.1f} dB" for one in compared.quality.each] == re.findall(r"<b>(file, [^<]*)", text)
+    with pytest.raises(InputError, match=r"page\.html exists"):
+        compare(scene, scene, views=views, pictures=page)

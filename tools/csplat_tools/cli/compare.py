@@ -11,11 +11,10 @@ import typer
 from csplat.context import Context
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
-from csplat.splat_file import SplatFile
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes
-from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import findings_of, load_scene, open_scenes, sample_scene
@@ -35,7 +34,7 @@ def compare(
     ] = "test",
     pictures: Annotated[
         str | None,
-        typer.Option(metavar="FOLDER", help="Write renders of A, B, and differences; or PAGE.html, see above."),
+        typer.Option(metavar="FOLDER", help="Write renders of A, B, differences; or PAGE.html, a page of them."),
     ] = None,
     lpips: Annotated[
         str | None, typer.Option(metavar="FILE.npz", help="Weights of LPIPS, or auto. Default: none.")
@@ -62,8 +61,7 @@ def compare(
     With --data, A and B are also scored against the held-out images. Scenes
     that do not fit in memory are rendered from the disk. --level applies to B.
     --backend gpu computes PSNR on a GPU (extra gpu), which may differ in the
-    third decimal. --pictures PAGE.html writes a page that shows a PLY and an
-    SPZ of as many bytes as B next to B. Requires the render extra.
+    third decimal. Requires the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
@@ -104,15 +102,9 @@ def compare(
                 lambda: 2 * total_render_seconds(model, view_set.test, mode=mode), "--backend cpu takes seconds"
             )
         compared = csplat_tools.compare(
-            source, other, views=view_set, source_index=rows, lpips=lpips, pictures=folder, background=views.colour,
+            source, other, views=view_set, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
             mode=mode, backend=device, force=out.force, context=context,
         )  # fmt: skip
-        if page is not None:
-            if source.in_memory is None or not isinstance(other, SplatFile):
-                raise InputError("--pictures PAGE.html requires a .csplat as B, and memory for both scenes")
-            from csplat_tools.optimise.equal_bytes import equal_bytes_page
-
-            write_bytes(page, equal_bytes_page(source, other, view_set, Path(a).stem, context).encode())
     out.publish(compared.as_json(), format_comparison(compared, Path(a).name, Path(b).name))
     if folder is not None:
         out.remark(f"{counted(len(compared.quality.each), 'file')} in {folder}")

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import check_free_space, finite_or_none, temporary_root
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.splat_file import SplatFile
@@ -36,9 +37,12 @@ from csplat_render.gpu.scoring import compare_scenes
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
 from csplat_render.scorer import OnView, Renderable, Scorer
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import check_output, write_bytes
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
 from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
+from csplat_tools.slider_page import Panel, slider_page
 from csplat_tools.views import VIRTUAL, Colour, ViewSet, find_view_set, views_off_path
 from csplat_tools.views.sliced_renderer import SlicedScene
 
@@ -46,6 +50,7 @@ Pairing = Literal["index", "order", "search"]
 _NEAR = 0.01  # fraction of the scene's spread; largest median distance of splats in the same order
 #: Name that searches LPIPS weights in the usual places, instead of a file.
 AUTO_WEIGHTS = "auto"
+_SHOWN = 8  # views of a page, which has a quarter of a megabyte for each
 _PIXEL_BYTES = 13  # bytes per pixel of the renders of the source, which are kept in memory
 
 
@@ -181,7 +186,8 @@ def compare(
             the eight virtual views of `psnr`, 640×480, on black (`find_view_set`).
         source_index: [N] the index in A of each splat of B.
         lpips: a file of LPIPS weights, or `auto` for the usual places; `None`: LPIPS is not computed.
-        pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference.
+        pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference; or PAGE.html,
+            a page that shows at most eight of the views with borders between A, B and the difference.
         amplification: factor of the difference.
         background: red, green, blue, 0..1; `None`: the background of the views.
         mode: mode of the renderer.
@@ -214,9 +220,15 @@ def compare(
             raise InputError(f"{views.name} has no {views.split} views")
         image_scorer = views.image_test_scorer(mode=mode, context=context) if views.images else None
         viewers: list[OnView] = []
+        page: _Page | None = None
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
-            viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
+            folder = os.fspath(pictures)
+            if folder.endswith(".html"):
+                page = _Page(folder, names, amplification, force=force)
+                viewers.append(page)
+            else:
+                viewers.append(_ImageWriter(folder, names, image_scorer, amplification, force=force))
         first: SplatModel | Renderable
         second: SplatModel | Renderable
         first, second, errors = _prepare_scenes(source, other, views.test, bound, source_index, context)
@@ -233,6 +245,8 @@ def compare(
             scorer = views.test_scorer(first, mode=mode, background=background, context=context)
             quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
             ignored = scorer.reference(0).ignored
+        if page is not None:
+            page.write(source, other, quality)
         elsewhere = {}
         if views.name != VIRTUAL and source.in_memory is not None and other.in_memory is not None:
             elsewhere = _psnr_off_path(source.in_memory, first, second, views, background, mode, context)
@@ -470,6 +484,38 @@ class _ImageWriter:
     def __call__(self, number: int, a: F32, b: F32) -> None:
         shown = None if self._image_scorer is None else self._image_scorer.reference(number).rgb
         write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
+
+
+class _Page:
+    """A page of at most `_SHOWN` of the views, spread evenly over all."""
+
+    def __init__(self, path: str, names: Sequence[str], amplification: float, *, force: bool) -> None:
+        check_output(path, force=force)
+        self._path, self._names, self._amplification = path, names, amplification
+        chosen = np.linspace(0, len(names) - 1, min(len(names), _SHOWN)).round()
+        self._views: dict[int, list[Panel]] = {int(number): [] for number in chosen}
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        if number in self._views:
+            pixels = np.split(side_by_side(a, b, self._amplification), 3, axis=1)
+            self._views[number] = [Panel.of("", "", one) for one in pixels]
+
+    def write(self, source: Scene, other: Scene, quality: Scores) -> None:
+        """Write the page, with the sizes of A and B and the PSNR of each view."""
+        views = []
+        for number, panels in self._views.items():
+            titles = (
+                f"source, {self._names[number]}",
+                f"file, {quality.each[number].psnr:.1f} dB",
+                f"difference × {self._amplification:g}",
+            )
+            remarks = [
+                f"{format_bytes(scene.size_bytes)}, {counted(scene.count, 'splat')}" for scene in (source, other)
+            ]
+            described = zip(panels, titles, [*remarks, ""], strict=True)
+            views.append([replace(panel, title=title, remark=remark) for panel, title, remark in described])
+        about = "Images are compressed for this page; scores are not measured on them."
+        write_bytes(self._path, slider_page(Path(self._path).stem, about, views).encode())
 
 
 def _all_of(viewers: Sequence[OnView]) -> OnView:
