@@ -164,7 +164,7 @@ PRESETS: dict[PresetName, Preset] = {
 #: cost 1.5 to 2 % of the bytes, for 0 to 0.3 dB, and entries are found in a fraction of the time. So "fast" has more
 #: of them, and the steps of "balanced", than which files of quantised scenes are to be no larger.
 QUANTISED_PRESETS: dict[PresetName, Preset] = {
-    "fast": Preset((52.5, 52.2), 43.0, "auto", 0.5, 1, codebook_most=1 << 10, escape_fraction=0.0),
+    "fast": Preset((52.5, 51.8), 43.0, "auto", 0.5, 1, codebook_most=1 << 10, escape_fraction=0.0),
     "balanced": replace(PRESETS["balanced"], escape_fraction=0.0),
     "small": replace(PRESETS["small"], escape_fraction=0.0),
 }
