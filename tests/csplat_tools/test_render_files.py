@@ -15,8 +15,13 @@ from command_line import call, hide_renderer
 from models import with_facts
 from PIL import Image
 
+import csplat
 from csplat import InputError, write_ply
 from csplat.ply import read_ply
+from csplat_render import Camera, render
+from csplat_render.camera import fitted, resized
+from csplat_render.first_view import first_view
+from csplat_render.metrics import psnr
 from csplat_tools import render_files
 from csplat_tools.cli.shared_options import parse_colour
 
@@ -103,16 +108,28 @@ def test_nothing_is_replaced_without_force(ply, cameras, film_scene, tmp_path):
     assert (24, 32, 3) == frame.shape
 
 
+def test_without_cameras_the_first_view_is_rendered(ply, tmp_path):
+    call("render", ply, tmp_path / "poster.webp", "--size", "60x40")
+    (poster,), _, _ = frames_of(tmp_path / "poster.webp")
+    camera = first_view(csplat.read(ply))
+    wide = fitted(camera, 60, 40)
+    assert (pytest.approx(camera.K[0, 0] * 40 / camera.H), 30.0, 20.0) == (wide.K[1, 1], *wide.K[:2, 2])
+    assert psnr(poster / 255.0, render(csplat.read(ply), wide).rgb) > 30.0  # WebP loses a little
+    call("render", ply, tmp_path / "out")
+    assert (480, 640, 3) == pixels(tmp_path / "out" / "0000.png").shape
+
+
 @pytest.mark.slow
 def test_a_wrong_command_line_is_refused(ply, cameras, tmp_path):
     for words in (
-        "out", "out --data set --cameras x.json", "out --cameras x.json --up z", "out --orbit 0",
+        "turn.mp4", "turn.gif", "out --data set --cameras x.json", "out --cameras x.json --up z", "out --orbit 0",
         "out --orbit 3 --size 12", "out --orbit 3 --backend wrong", "a.tif --orbit 3", "turn.webp --orbit 2 --depth",
         "turn.webp --orbit 2 --fps 101",
     ):  # fmt: skip
         name, *options = words.split()
         call("render", ply, tmp_path / name, *options, status=2)
     assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "no", "--size", "64x64")
+    resized(Camera(np.eye(3), np.eye(4), 391, 261), 1200, 800)  # a rounded 3:2
     assert ["ball.ply", "cameras.json"] == names(tmp_path)
     with pytest.raises(InputError, match="not a folder"):
         render_files.make_output_folder(str(cameras), ["a.png"], force=True)

@@ -289,14 +289,27 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     """Return the camera with another image size.
 
     Raises:
-        InputError: the aspect ratio changes by more than the rounding of a pixel.
+        InputError: the aspect ratio changes by more than the rounding of a pixel of either image.
     """
     across, down = width / camera.W, height / camera.H
-    if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
+    if abs(camera.H * across - height) > max(1.0, across) and abs(camera.W * down - width) > max(1.0, down):
         raise InputError(
             f"the camera's image has {camera.W}x{camera.H} pixels: at {width}x{height} it would be distorted"
         )
     return replace(camera, K=np.diag([across, down, 1.0]) @ camera.K, W=width, H=height)
+
+
+def fitted(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera with another image size that shows at least what this one shows, as viewers fit a first view.
+
+    Args:
+        camera: the camera, with the principal point in the middle of its image.
+        width, height: pixels.
+    """
+    factor = min(width / camera.W, height / camera.H)
+    K = np.diag([factor, factor, 1.0]) @ camera.K
+    K[:2, 2] = width / 2.0, height / 2.0
+    return replace(camera, K=K, W=width, H=height)
 
 
 def intrinsics(width: int, height: int, field_of_view: float) -> F64:

@@ -27,7 +27,8 @@ _NOT_WRITTEN = (".avi", ".bmp", ".exr", ".hdr", ".m4v", ".mkv", ".mov", ".mpg", 
 def render(
     source: shared.SceneArgument,
     output: Annotated[
-        str, typer.Argument(metavar="OUT", help="A folder for PNG files; or NAME.mp4, .webp, .gif, .png: a video.")
+        str,
+        typer.Argument(metavar="OUT", help="NAME.webp, .png: image or video; NAME.mp4, .gif: video; or a folder."),
     ],
     cameras: Annotated[str | None, typer.Option(metavar="FILE.json", help="Cameras, in a format listed above.")] = None,
     data: Annotated[str | None, typer.Option(metavar="DATA", help="Cameras of a data set's test images.")] = None,
@@ -52,9 +53,10 @@ def render(
     quiet: shared.Quiet = False,
     _all: shared.HelpAll = False,
 ) -> None:
-    """Render a scene to PNG files, or to a video.
+    """Render a scene to an image, to PNG files, or to a video.
 
-    Renders are named after the images of their cameras, or numbered. Camera
+    Without cameras, the first view is rendered, which viewers show, too. Files
+    in a folder are named after the images of their cameras, or numbered. Camera
     files: our own list of {K, viewmat, W, H, near, image}, INRIA's
     cameras.json, camera paths of nerfstudio, and transforms.json. An orbit
     shows a whole object; with cameras it follows them. --backend gpu renders
@@ -62,6 +64,7 @@ def render(
     CPU. MP4 requires the film extra, and everything the render extra.
 
     Examples:
+      csplat render scene.csplat poster.webp --size 1200x800
       csplat render scene.csplat turn.mp4 --orbit 120
       csplat render room.csplat room.webp --orbit 240 --level 500k
       csplat render scene.ply held-out --data capture
@@ -69,8 +72,8 @@ def render(
     """
     out = Output(force, report, as_json, quiet)
     is_video, views = is_film(output), shared.ViewOptions(cameras, data, background)
-    if cameras is None and orbit is None and data is None:
-        raise typer.BadParameter("expected cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
+    if cameras is None and orbit is None and data is None and Path(output).suffix.lower() in (".mp4", ".gif"):
+        raise typer.BadParameter(f"{output} is a video, expected --orbit 120 for a path around the scene, or cameras")
     if output == STANDARD_STREAM or Path(output).suffix.lower() in _NOT_WRITTEN:
         raise typer.BadParameter(f"OUT is {output}, expected a folder, or a video: NAME.mp4, .webp, .gif or .png")
     if is_video and (depth or alpha):
@@ -106,7 +109,7 @@ def render(
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")
     out.remark(
-        f"{counted(len(shots), 'frame')} in {output}"
+        f"{'image' if len(shots) == 1 else counted(len(shots), 'frame')} in {output}"
         if is_video
         else f"{counted(len(rendered.files), 'file')} in {output}"
     )

@@ -15,10 +15,11 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32
 from csplat_render import Backend, Camera, Mode
-from csplat_render.camera import resized
+from csplat_render.camera import fitted, resized
 from csplat_render.camera_files import load_cameras
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.conventions import Render, RenderResult
+from csplat_render.first_view import first_view
 from csplat_render.scorer import Renderable, renderer
 from csplat_tools.file_streams import check_output, write_array
 from csplat_tools.optional_packages import require_images, require_renderer
@@ -51,7 +52,7 @@ def find_cameras(
     split: Split = "test",
     report: list[str] | None = None,
 ) -> list[Camera]:
-    """Return the cameras of a file, of a data set, or of an orbit.
+    """Return the cameras of a file, of a data set, or of an orbit; without any of these the first view alone.
 
     Args:
         model: the scene; cameras are relative to its origin.
@@ -63,11 +64,11 @@ def find_cameras(
         report: receives remarks on camera files of other programs.
 
     Raises:
-        InputError: none of the three is given, or both a file and a set; the file or the set is invalid; `size` has
-            another aspect ratio.
+        InputError: both a file and a set are given; the file or the set is invalid; `size` has another aspect ratio;
+            the scene has no first view.
     """
     if path is None and orbit_count is None and data is None:
-        raise InputError("expected cameras: a file, a data set, or a number for an orbit")
+        return [fitted(first_view(model), *(size or _DEFAULT_SIZE))]
     if path is not None and data is not None:
         raise InputError("a camera file and a data set are given, expected only one of them")
     cameras: list[Camera] = []
