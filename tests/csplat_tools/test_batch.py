@@ -140,7 +140,7 @@ def test_a_killed_process_fails_its_scene_alone_and_an_interrupt_is_not_lost(sce
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_an_ended_batch_leaves_no_processes_and_is_continued(scenes, tmp_path, number):
     out, stuck = tmp_path / "out", scenes / "stuck.ply"
     os.mkfifo(stuck)  # without a size it comes last
@@ -149,7 +149,7 @@ def test_an_ended_batch_leaves_no_processes_and_is_continued(scenes, tmp_path, n
     with stuck.open("wb"):  # waits for a worker to read it
         running.send_signal(number)
         error = running.communicate(timeout=60)[1]  # its processes have the same pipe
-    assert (130 if number == signal.SIGINT else -number) == running.returncode
+    assert (-number if number == signal.SIGKILL else 128 + number) == running.returncode
     assert ("Traceback" in error, []) == (False, list(out.rglob(".*")))
     stuck.unlink()
     again = json.loads(subprocess.run([*line, "--json"], capture_output=True, check=False).stdout)

@@ -153,11 +153,12 @@ def test_a_closed_or_full_standard_stream_is_an_error_of_one_line(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_status_of_its_signal_and_leaves_nothing(tmp_path, number):
     with child([*PROGRAM, "encode", "-", str(tmp_path / "out.csplat")]) as running:
         running.stdin.write(bytes(1 << 20))  # more than a pipe holds: it has begun to read
-        running.send_signal(signal.SIGINT)
-        assert 130 == running.wait(20)
+        running.send_signal(number)
+        assert 128 + number == running.wait(20)
         assert b"interrupted\n" == running.stderr.read()
     assert [] == list(tmp_path.iterdir())
 

@@ -11,7 +11,7 @@ from types import FrameType
 
 from csplat_tools import VERSIONS
 
-_INTERRUPTED = 130  # exit status: 128 + SIGINT, the convention of shells
+_OF_SIGNAL = 128  # exit status of a command that a signal interrupts: this and its number, the convention of shells
 
 
 def main() -> None:
@@ -31,8 +31,9 @@ def main() -> None:
         interrupts.append(number)
         raise KeyboardInterrupt
 
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # a shell's background ignores it
-        signal.signal(signal.SIGINT, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):  # both keep what a search or a training has so far
+        if signal.getsignal(number) != signal.SIG_IGN:  # a shell's background ignores SIGINT
+            signal.signal(number, interrupt)
     try:
         from csplat_tools.cli.app import app
 
@@ -43,8 +44,12 @@ def main() -> None:
             raise
     except KeyboardInterrupt:
         pass
+    except SystemExit as end:
+        if interrupts and end.code == _OF_SIGNAL + signal.SIGINT:
+            sys.exit(_OF_SIGNAL + interrupts[0])
+        raise
     sys.stderr.write("interrupted\n")
-    sys.exit(_INTERRUPTED)
+    sys.exit(_OF_SIGNAL + (interrupts or [signal.SIGINT])[0])
 
 
 def _open_closed_streams() -> None:

@@ -155,7 +155,10 @@ def run_batch(
     sizes = {task: path.stat().st_size for task in tasks if (path := Path(task.source)).is_file()}
     todo = deque(sorted(tasks, key=lambda task: -sizes.get(task, 0)))  # the largest first
     running: dict[Future[SceneResult], tuple[Any, Task]] = {}
-    with nullcontext() if scheduler is None else open_client(scheduler) as client, interrupts_noted() as interrupts:
+    with (
+        nullcontext() if scheduler is None else open_client(scheduler) as client,
+        interrupts_noted(signal.SIGINT, signal.SIGTERM) as interrupts,
+    ):
         new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker)
         idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
         try:
