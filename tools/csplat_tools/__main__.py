@@ -32,7 +32,8 @@ def main() -> None:
         raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):  # both keep what a search or a training has so far
-        if signal.getsignal(number) != signal.SIG_IGN:  # a shell's background ignores SIGINT
+        # A shell's background ignores SIGINT, and a batch ends its workers in its own way.
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, interrupt)
     try:
         from csplat_tools.cli.app import app
