@@ -71,11 +71,12 @@ def markdown_table(rows: Iterable[Row], columns: Sequence[Column], labels: Mappi
         labels: texts that replace whole cells.
     """
     labels, pairs = labels or {}, [_heading_and_templates(column) for column in columns]
-    lines = [[heading for heading, _ in pairs], ["---"] * len(pairs)]
+    lines = [[heading for heading, _ in pairs]]
     for row in map(flatten, rows):
         cells = [_first_cell(templates, row) for _, templates in pairs]
         lines.append([labels.get(text, text) for text in cells])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    head, *body = (f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join([head, f"|{'---|' * len(pairs)}", *body])
 
 
 def _heading_and_templates(column: Column) -> tuple[str, Sequence[str]]:
