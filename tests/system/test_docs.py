@@ -203,7 +203,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     assert {"small.csplat", "target.csplat"} == {path.name for path in tmp_path.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_formats_are_shown_at_equal_bytes(tmp_path, monkeypatch, sample_path):
     """With few splats, small images, and cameras on three sides."""
     monkeypatch.syspath_prepend(DOCS)

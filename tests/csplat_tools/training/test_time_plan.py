@@ -78,8 +78,9 @@ def test_the_printed_command_makes_the_same_file_and_resume_takes_its_settings(t
     write_photographs(photographs)
     monkeypatch.setattr(time_plan, "_LEAST_SIDE", 8)  # the images are smaller than any that would be scaled
     monkeypatch.setattr(time_plan, "candidate_sizes", lambda sizes: candidate_sizes(sizes)[1:2])
+    monkeypatch.setattr(time_plan, "_SPLATS", (500, 2000))  # seconds less
     options = ("--sh-degree", 0, "--target-size", "5kB", "--checkpoint", tmp_path / "run.npz")
-    messages = call("train", photographs, timed, "--time", "2s", *options).stderr
+    messages = call("train", photographs, timed, "--time", "1s", *options).stderr
     (line,) = (line for line in messages.splitlines() if line.startswith("to repeat it: csplat train "))
     words = shlex.split(line.removeprefix("to repeat it: csplat "))
     assert {"--max-splats", "--iterations", "--size"} <= {*words}
