@@ -418,7 +418,7 @@ class HardestPlaceSearch:
             return None
         number, rows, columns, source, decoded = self._place
         a, b = source[rows, columns], decoded[rows, columns]
-        pieces = [_reduced(image) for image in np.split(side_by_side(a, b, _AMPLIFICATION), 3, axis=1)]
+        pieces = [reduced(image) for image in np.split(side_by_side(a, b, _AMPLIFICATION), 3, axis=1)]
         return ImagePiece(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
 
 
@@ -442,7 +442,7 @@ def image_row(images: Mapping[str, U8], name: str) -> str:
     """
     figures = ""
     for word, pixels in images.items():
-        small = _reduced(pixels)
+        small = reduced(pixels)
         figures += (
             f'<figure><img src="{data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
             f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
@@ -463,7 +463,7 @@ def _framed(image: F32, rows: slice, columns: slice) -> U8:
 
     The frame runs inside the edge of the piece at `rows` and `columns`, which are in pixels of the view.
     """
-    shown = _reduced(to_uint8(image)).copy()
+    shown = reduced(to_uint8(image)).copy()
     factor = shown.shape[0] / image.shape[0]
     top, bottom, left, right = (round(factor * edge) for edge in (rows.start, rows.stop, columns.start, columns.stop))
     for inset, value in enumerate((0, 255, 0)):  # black, white and black lines of one pixel, from outside
@@ -484,12 +484,12 @@ def data_uri(pixels: U8) -> str:
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _reduced(pixels: U8) -> U8:
-    """Return an image, [H, W, 3], with sides of at most `_SIDE` pixels in the same proportion; unchanged if smaller."""
+def reduced(pixels: U8, side: int = _SIDE) -> U8:
+    """Return an image, [H, W, 3], with sides of at most `side` pixels in the same proportion; unchanged if smaller."""
     from PIL import Image
 
     height, width = pixels.shape[:2]
-    factor = _SIDE / max(width, height)
+    factor = side / max(width, height)
     if factor >= 1.0:
         return np.ascontiguousarray(pixels)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))

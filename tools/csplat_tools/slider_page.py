@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from html import escape
 
 from csplat.types import U8
-from csplat_tools.html_report import data_uri
+from csplat_tools.html_report import data_uri, reduced
+
+_SIDE = 1280  # largest side of an image, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class Panel:
 
     @classmethod
     def of(cls, title: str, remark: str, pixels: U8) -> Panel:
-        """Return the panel of an image [H, W, 3]."""
+        """Return the panel of an image [H, W, 3], reduced to the width of the page."""
+        pixels = reduced(pixels, _SIDE)
         return cls(title, remark, data_uri(pixels), (pixels.shape[1], pixels.shape[0]))
 
 
@@ -42,6 +45,7 @@ def slider_page(title: str, about: str, views: Sequence[Sequence[Panel]]) -> str
         views: images of each view, at least two, of one size.
     """
     return _TEMPLATE % {
+        "side": _SIDE,
         "title": escape(title),
         "about": escape(about),
         "views": "".join(_view(panels) for panels in views),
@@ -72,7 +76,7 @@ _TEMPLATE = """<!doctype html>
 <link rel="icon" href="data:,">
 <style>
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
-body { margin: 0 auto; max-width: 1280px; padding: 12px; }
+body { margin: 0 auto; max-width: %(side)dpx; padding: 12px; }
 h1 { font-size: 1.3rem; margin: 0 0 8px; overflow-wrap: anywhere; }
 .stage { position: relative; overflow: hidden; touch-action: pan-y; cursor: ew-resize; user-select: none; }
 .stage img { display: block; width: 100%%; height: auto; position: absolute; top: 0; }
