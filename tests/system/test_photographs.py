@@ -13,6 +13,7 @@ from command_line import call, invoke
 from PIL import Image
 from posed_sets import to_opengl, write_document
 
+import csplat
 from csplat import EncodeOptions, encode, write_ply
 from csplat.errors import InputError
 from csplat_render import render
@@ -81,7 +82,11 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     assert a["psnr"] > 50.0  # rounding to bytes is the only error
     assert b["psnr"] == pytest.approx(result["psnr"], abs=0.2)
     assert b["ssim"] < a["ssim"]
-    assert "B - A" in call("compare", *files, "--data", data).stdout  # the table
+    table = call("compare", *files, "--data", data).stdout
+    assert f"the worst image is {a['worst_image']} in A, {b['worst_image']} in B" in table
+    assert min(a["psnr_worst"], b["psnr_worst"]) == b["psnr_worst"]
+    again = csplat.compare(*map(str, files), data=str(data))
+    assert (scores, result["psnr"]) == (again.images, again.psnr)
     training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
     assert 6 == training["images"]["a"]["views"]

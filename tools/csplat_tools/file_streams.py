@@ -210,7 +210,7 @@ def source_path(file: File) -> Iterator[Path]:
         if is_csplat(local):
             _refuse_other_formats(local)
             raise InputError(
-                f"{local.name} is a .csplat file already: `csplat decode` converts it to a PLY,"
+                f"{local.name} is a .csplat file already: `csplat decode {local.name} {local.stem}.ply` makes a PLY,"
                 " `csplat info` describes it"
             )
         yield local

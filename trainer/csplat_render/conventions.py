@@ -14,7 +14,7 @@ its transmittance below `TRANSMITTANCE_MIN`.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -192,10 +192,10 @@ class RenderResult:
         ignored: number of splats with NaN or infinity.
     """
 
-    rgb: Array
-    alpha: Array
-    depth: Array
-    radii: Array
+    rgb: Array = field(repr=False)
+    alpha: Array = field(repr=False)
+    depth: Array = field(repr=False)
+    radii: Array = field(repr=False)
     drawn: int
     intersections: int
     ignored: int

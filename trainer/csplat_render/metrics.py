@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,7 @@ class Scores:
         psnr_mean: dB, mean over views.
         psnr_worst: dB, minimum over views.
         worst_view: index of that view, from 0.
+        worst_image: name of its image file; `None`: it has none.
         ssim, lpips: means over views; `None` if not requested.
         psnr_covered: dB, pooled over covered pixels; `None` if cover is unknown or 0.
         cover: fraction of covered pixels over all views; `None` if unknown.
@@ -81,6 +82,7 @@ class Scores:
     psnr_mean: float
     psnr_worst: float
     worst_view: int
+    worst_image: str | None
     ssim: float | None
     lpips: float | None
     psnr_covered: float | None
@@ -108,6 +110,7 @@ class Scores:
             psnr_mean=math.fsum(view.psnr for view in each) / len(each),
             psnr_worst=each[worst].psnr,
             worst_view=worst,
+            worst_image=each[worst].image,
             ssim=_mean_of_known([view.ssim for view in each]),
             lpips=_mean_of_known([view.lpips for view in each]),
             psnr_covered=psnr_of_mse(missed / math.fsum(covered)) if any(covered) else None,
@@ -117,7 +120,7 @@ class Scores:
 
     def as_json(self) -> dict[str, Any]:
         """Return the pooled scores and the number of views, JSON-compatible."""
-        names = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "psnr_covered", "cover")
+        names = [one.name for one in fields(self) if one.name not in ("each", "ignored")]
         return {"views": len(self.each), **{name: getattr(self, name) for name in names}}
 
 

@@ -64,6 +64,7 @@ def test_an_object_was_photographed_from_above():
     for up in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)):
         assert list(up) == with_estimated_up(photographed_from(up)).metadata.entries["up"]  # what `estimate_up` returns
         assert up == parse_up(up_word(up))
+    assert (0.0, pytest.approx(-0.8), pytest.approx(0.6)) == parse_up(up_word((0.0, -0.8, 0.6)))
 
 
 @pytest.mark.slow

@@ -379,9 +379,11 @@ def parse_up(text: str) -> Direction:
 
 
 def up_word(axis: Direction) -> str:
-    """Return an axis, or its opposite, in the form that `parse_up` accepts."""
-    at = next(k for k, value in enumerate(axis) if value)
-    return ("-" if axis[at] < 0.0 else "") + "xyz"[at]
+    """Return a direction in the form that `parse_up` accepts: an axis, or three numbers."""
+    along = [k for k, value in enumerate(axis) if value]
+    if len(along) != 1:
+        return ",".join(f"{value:.3g}" for value in axis)
+    return ("-" if axis[along[0]] < 0.0 else "") + "xyz"[along[0]]
 
 
 def parse_axes(text: str) -> str:

@@ -43,7 +43,7 @@ from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
 from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
 from csplat_tools.slider_page import Panel, slider_page
-from csplat_tools.views import VIRTUAL, Colour, ViewSet, find_view_set, views_off_path
+from csplat_tools.views import VIRTUAL, Colour, DataOptions, ViewSet, find_view_set, views_off_path
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
@@ -166,6 +166,8 @@ def compare(
     a: SceneLike,
     b: SceneLike,
     *,
+    cameras: str | os.PathLike[str] | None = None,
+    data: str | DataOptions | None = None,
     views: ViewSet | None = None,
     source_index: NDArray[np.integer[Any]] | None = None,
     lpips: str | None = None,
@@ -182,8 +184,10 @@ def compare(
     Args:
         a, b: the source, and the scene compared with it: models, open scenes, or files in any
             format.
-        views: the views; A and B are scored on the test views, against their images, too, if there are any. `None`:
-            the eight virtual views of `psnr`, 640×480, on black (`find_view_set`).
+        cameras: a camera file with the views.
+        data: a data set, whose test images are the views; A and B are scored against them, too.
+        views: the views, found already (`find_view_set`). Default without any of the three: the eight virtual views of
+            `psnr`, 640×480, on black.
         source_index: [N] the index in A of each splat of B.
         lpips: a file of LPIPS weights, or `auto` for the usual places; `None`: LPIPS is not computed.
         pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference; or PAGE.html,
@@ -215,7 +219,7 @@ def compare(
         require_images()
     distance = None if lpips is None else load_lpips(None if lpips == AUTO_WEIGHTS else lpips)
     with open_scenes((a, b), context) as (source, other):
-        views = views or _views(source, background, context)
+        views = views or _views(source, cameras, data, background, context)
         if not views.test:
             raise InputError(f"{views.name} has no {views.split} views")
         image_scorer = views.image_test_scorer(mode=mode, context=context) if views.images else None
@@ -369,10 +373,23 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
     return float(np.median(distances)) <= _NEAR * spread
 
 
-def _views(source: Scene, background: Colour | None, context: Context) -> ViewSet:
+def _views(
+    source: Scene,
+    cameras: str | os.PathLike[str] | None,
+    data: str | DataOptions | None,
+    background: Colour | None,
+    context: Context,
+) -> ViewSet:
     """Return the views of a scene, of which only a sample is read; none are for training."""
     model, every = sample_scene(source, progress=context.progress)
-    return find_view_set(model, background=background, count=0, every=every)
+    return find_view_set(
+        model,
+        cameras=None if cameras is None else os.fspath(cameras),
+        data=DataOptions(data) if isinstance(data, str) else data,
+        background=background,
+        count=0,
+        every=every,
+    )
 
 
 def _prepare_scenes(

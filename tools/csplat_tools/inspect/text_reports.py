@@ -117,12 +117,14 @@ def _scores(compared: Comparison) -> str:
 def _image_scores(scores: dict[str, Any]) -> str:
     """Format the scores of renders of both scenes against images; metrics that one lacks are left out."""
     rows = []
-    for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
+    decibels = ("psnr", "psnr_mean", "psnr_worst", "psnr_covered")
+    for name, digits in (*((one, 2) for one in decibels), ("ssim", 5), ("lpips", 5)):
         a, b = scores["a"][name], scores["b"][name]
         if a is not None and b is not None:
             rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
     header = (f"against {scores['a']['views']} {scores['split']} images", "A", "B", "B - A")
-    return format_table(header, rows)
+    worst = [scores[scene]["worst_image"] for scene in ("a", "b")]
+    return f"{format_table(header, rows)}\nthe worst image is {worst[0]} in A, {worst[1]} in B"
 
 
 def _ignored_lines(compared: Comparison) -> list[str]:

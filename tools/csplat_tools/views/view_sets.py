@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -93,10 +93,10 @@ class ViewSet:
 
     name: str
     background: Colour
-    training: Sequence[Camera]
-    validation: Sequence[Camera]
-    test: Sequence[Camera]
-    images: Sequence[PosedImage] = ()
+    training: Sequence[Camera] = field(repr=False)
+    validation: Sequence[Camera] = field(repr=False)
+    test: Sequence[Camera] = field(repr=False)
+    images: Sequence[PosedImage] = field(default=(), repr=False)
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
@@ -476,7 +476,7 @@ def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple
     """Return the user's options, completed from the scene's metadata, and remarks on contradictions."""
     values: dict[str, Any] = {}
     notes = []
-    for name in (field.name for field in fields(data) if field.name != "path"):
+    for name in (one.name for one in fields(data) if one.name != "path"):
         option, recorded = getattr(data, name), getattr(record, name, None)
         values[name] = recorded if option is None else option
         if option is not None and recorded is not None and option != recorded:
