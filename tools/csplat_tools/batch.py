@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, replace
@@ -85,7 +85,10 @@ class Task:
 
 @dataclass(frozen=True)
 class SceneResult:
-    """The outcome of one scene: the files of its `Task`, the error in one line, other messages of the command."""
+    """The outcome of one scene: the files of its `Task`, the error in one line, other messages of the command.
+
+    `psnr`, dB, is that of the report of a target.
+    """
 
     path: str
     output: str
@@ -95,6 +98,7 @@ class SceneResult:
     source_bytes: int | None = None
     output_bytes: int | None = None
     splats: int | None = None
+    psnr: float | None = None
     seconds: float | None = None
 
 
@@ -383,7 +387,8 @@ def run_scene(
                 error = error.replace(str(source), task.source).replace(str(output), task.output)
                 return replace(result, error=error.removeprefix(f"{task.source}: "), remarks=tuple(lines[:-1]))
             with suppress(ValueError, TypeError, KeyError):  # commands with another result
-                result = replace(result, splats=json.loads(out)["splats"])
+                report = json.loads(out)
+                result = replace(result, splats=report["splats"], psnr=(report.get("target") or {}).get("psnr"))
             return replace(result, state="done", output_bytes=size_on_disk(output))
     except SystemExit:
         os._exit(_STATUS_ENDED)  # the pool would catch it, and go on
@@ -498,10 +503,17 @@ def make_batch_page(batch: Batch) -> str:
         "done": f"{len(done):,} of {len(batch.results):,}",
         "bytes": f"{format_bytes(source_bytes)} -> {format_bytes(output_bytes)}",
     }
-    heads = [html.Head("scene", kind="name"), *map(html.Head, ("splats", "source, kB", "output, kB", "seconds"))]
+    columns: dict[str, Callable[[SceneResult], float | None]] = {
+        "splats": lambda result: result.splats,
+        "source, kB": lambda result: (result.source_bytes or 0) / 1e3,
+        "output, kB": lambda result: (result.output_bytes or 0) / 1e3,
+        **({"PSNR, dB": lambda result: result.psnr} if any(result.psnr is not None for result in done) else {}),
+        "seconds": lambda result: result.seconds,
+    }
+    heads = [html.Head("scene", kind="link"), *map(html.Head, columns)]
     rows = []
     for result in done:
-        values = result.splats, (result.source_bytes or 0) / 1e3, (result.output_bytes or 0) / 1e3, result.seconds
+        values = (of(result) for of in columns.values())
         rows.append([(result.output, result.path), *((_cell_text(value), value) for value in values)])
     errors = (
         html.table(("scene", "error"), [(result.path, result.error) for result in failed], words=(1,)) if failed else ""

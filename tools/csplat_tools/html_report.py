@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -153,15 +154,15 @@ class Head:
 
     Attributes:
         title: title of the column.
-        kind: `number` or `name`, which a click on the heading sorts; or `html`, which is not sorted.
+        kind: `number`, `name` or `link`, which a click on the heading sorts; or `html`, which is not sorted.
     """
 
     title: str
-    kind: Literal["number", "name", "html"] = "number"
+    kind: Literal["number", "name", "link", "html"] = "number"
 
     def html(self) -> str:
         """Return the cell of the heading."""
-        kind = ' class="name" data-kind="text"' if self.kind == "name" else ""
+        kind = ' class="name" data-kind="text"' if self.kind in ("name", "link") else ""
         title = escape(self.title)
         return f'<th scope="col"{kind}>' + (
             f"{title}</th>" if self.kind == "html" else f'<button type="button">{title}</button></th>'
@@ -175,7 +176,10 @@ class Head:
         if self.kind == "number":
             return f'<td data-value="{"" if more is None else f"{more:.6g}"}">{escape(text)}</td>'
         hint = f' title="{escape(more)}"' if more else ""
-        return f'<td class="name" data-value="{escape(text)}"{hint}>{escape(text)}</td>'
+        shown = (
+            f'<a href="{escape(quote(text, safe="/:"))}">{escape(text)}</a>' if self.kind == "link" else escape(text)
+        )
+        return f'<td class="name" data-value="{escape(text)}"{hint}>{shown}</td>'
 
 
 def sortable_table(heads: Sequence[Head], rows: Sequence[Sequence[Any]], marked: Collection[int] = ()) -> str:
@@ -184,7 +188,8 @@ def sortable_table(heads: Sequence[Head], rows: Sequence[Sequence[Any]], marked:
     Args:
         heads: headings of the columns.
         rows: cells by the kind of their column. `number`: (text, value), a value of `None` comes last. `name`: (text,
-            text that appears when the mouse rests on it). `html`: HTML.
+            text that appears when the mouse rests on it). `link`: the same, with a path, which it leads to. `html`:
+            HTML.
         marked: indices of rows with another background.
     """
     lines = [
