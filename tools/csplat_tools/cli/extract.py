@@ -34,8 +34,8 @@ def extract(
     Tiles that touch the box are copied unchanged, with up to 65,536 splats
     each: some splats around the box are copied, too. `csplat convert --crop`
     cuts splat by splat. Corners are relative to the origin, along the axes of
-    the file. Declared errors are left out. Of a URL (https, s3 and others) only the index and the
-    copied tiles are fetched; that requires the remote extra.
+    the file. Declared errors are left out. Of a URL (https, s3 and others) only
+    the index and the copied tiles are fetched; that requires the remote extra.
 
     Examples:
       csplat extract city.csplat square.csplat --box -10,-2,-10,10,8,10
@@ -49,12 +49,15 @@ def extract(
     with out.bar(), SplatFile.open(csplat_file(source)) as file, whole_output(output) as stream:
         part = csplat.extract(file, corners, stream)
         size, read, requests, axes = file.size_bytes, file.bytes_read, file.requests, file.header.coordinate_system
+        is_whole = part.splat_count == file.count
     which = "which it does not name" if axes == UNSPECIFIED else f"x, y, z = {axes}"
     out.remark(f"--box: along the axes of {source}, {which}")
     out.remark(
         f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size)};"
         f" read {format_bytes(read)} of {format_bytes(size)}, in {counted(requests, 'request')}"
     )
+    if is_whole:
+        out.remark("the box touches every tile, so nothing is left out: `csplat convert --crop` cuts splat by splat")
     out.publish(
         {
             "splats": part.splat_count,
