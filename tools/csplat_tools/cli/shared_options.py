@@ -21,7 +21,7 @@ import typer
 from csplat._spec import MEASURE_NAMES
 from csplat.disk_files import resolve_links
 from csplat.encoder import PresetName, Target
-from csplat.errors import InputError
+from csplat.errors import CsplatError, InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.scene_metadata import Direction, check_axes, unit_up
 from csplat_render import Backend, Mode
@@ -409,35 +409,47 @@ def is_same_file(a: str | None, b: str | None) -> bool:
 
 @contextmanager
 def run_checkpoint(
-    checkpoint: str | None, resume: str | None, output: str, others: Callable[[str], Sequence[Path]] = lambda _: ()
+    checkpoint: str | None,
+    resume: str | None,
+    output: str,
+    others: Callable[[str], Sequence[Path]] = lambda _: (),
+    *,
+    keep_refused: bool = False,
 ) -> Iterator[str | None]:
-    """Yield the path of a run's checkpoint: that of --checkpoint, or OUT.npz, which only an interrupted run leaves.
+    """Yield the path of a run's checkpoint: that of --checkpoint, or OUT.npz.
+
+    OUT.npz and further checkpoints are removed when the run has succeeded, but no file that an option names.
 
     Args:
         checkpoint, resume: the options.
         output: the file that the run writes.
         others: returns the paths of further checkpoints of the run, from that of the first.
+        keep_refused: keep OUT.npz of a run that is refused after some steps, as for a target that it cannot meet.
 
     Raises:
-        InputError: an interrupted run has left OUT.npz, and --resume does not name it.
+        InputError: an earlier run has left OUT.npz, and --resume does not name it.
     """
     path = checkpoint if checkpoint is not None or output == STANDARD_STREAM else f"{output}.npz"
     if path is None:
         yield None
         return
-    is_own = checkpoint is None
-    if is_own and Path(path).exists() and not is_same_file(path, resume):
-        raise InputError(f"{path} is left from an interrupted run: continue with --resume {path}, or remove it")
-    is_over = True
+    is_named = checkpoint is not None or is_same_file(path, resume)
+    if not is_named and Path(path).exists():
+        raise InputError(f"{path} is left from an earlier run: continue with --resume {path}, or remove it")
+    further = [*others(path)]
+    removed = further if is_named else [Path(path), *further]
     try:
         yield path
-    except (KeyboardInterrupt, SystemExit, OSError, MemoryError):
-        is_over = not Path(path).exists()
-        if not is_over:
+    except BaseException as error:
+        is_refused = isinstance(error, CsplatError)
+        if is_named and is_refused:
+            removed = []
+        elif Path(path).exists() and (keep_refused or not is_refused):
             note(f"{path} holds the finished steps: --resume {path} continues from them")
+            removed = further if is_refused else []
         raise
     finally:
-        for file in (Path(path), *others(path)) if is_own and is_over else ():
+        for file in removed:
             file.unlink(missing_ok=True)
 
 

@@ -144,7 +144,10 @@ def train(
     options = replace(options, max_splats=settings.max_splats, iterations=settings.iterations)
     if to_file:
         options = plan_training(options, target, max_splats=settings.max_splats)
-    kept = shared.run_checkpoint(checkpoint, resume, output, lambda path: [tuning_checkpoint(path)])
+    kept = shared.run_checkpoint(
+        checkpoint, resume, output, lambda path: [tuning_checkpoint(path)] if to_file else [],
+        keep_refused=resume is None,
+    )  # fmt: skip
     with kept as path, out.bar() as progress:
         files, run = Outputs(path, preview=preview, resume=resume), Context(seed=seed, progress=progress)
         if to_file:
@@ -158,7 +161,21 @@ def train(
             )
     if to_file:
         out.remark(format_tuning_report(result["file"]), *explain_size(result, target))
+        out.remark(_describe_next_steps(output, checkpoint or resume))
     out.publish(result)
+
+
+def _describe_next_steps(output: str, checkpoint: str | None) -> str:
+    """Return a line on what to do with a file, and how to make others of the same training.
+
+    Args:
+        output: the file.
+        checkpoint: the checkpoint that the run leaves; `None`: it is removed.
+    """
+    other_sizes = f"`--resume {shlex.quote(checkpoint or 'run.npz')} --target-size …` makes other sizes"
+    if checkpoint is None:
+        other_sizes = f"with `--checkpoint run.npz`, {other_sizes} of a training"
+    return f"`csplat view {shlex.quote(output)}` shows it; {other_sizes}"
 
 
 def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Context) -> list[str]:
