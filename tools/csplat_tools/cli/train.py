@@ -24,6 +24,7 @@ _BACKGROUNDS = ", ".join(BACKGROUNDS)
 if TYPE_CHECKING:
     from csplat_tools.training.time_plan import TrainingSettings
 
+_FRACTIONS = {2: "half", 4: "a quarter of", 8: "an eighth of"}  # of the width of images, by how many times less it is
 _HOUR = 3600.0  # seconds, the default of --time
 
 
@@ -136,8 +137,8 @@ def train(
     elif iterations is None:
         with out.bar() as progress:
             settings = plan_in_time(
-                data, options, seconds, to_file=to_file, max_splats=max_splats, most_splats=splats_for(target),
-                context=Context(seed=seed, progress=progress),
+                data, options, seconds, to_file=to_file, max_splats=max_splats,
+                most_splats=splats_for(target, most=True), context=Context(seed=seed, progress=progress),
             )  # fmt: skip
         out.remark(*_describe_plan(settings, seconds, context))
     data = replace(data, size=settings.size)
@@ -180,14 +181,21 @@ def _describe_next_steps(output: str, checkpoint: str | None) -> str:
 
 def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Context) -> list[str]:
     """Return lines on the settings of a timed training, and the command that repeats it."""
-    size = "" if settings.size is None else ", images of {}×{} pixels".format(*settings.size)
-    text = f"{settings.max_splats:,} splats, {settings.iterations:,} steps{size}"
-    late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"
+    text, scaled = f"{settings.max_splats:,} splats, {settings.iterations:,} steps", []
     chosen = {"--max-splats": str(settings.max_splats), "--iterations": str(settings.iterations)}
     if settings.size is not None:
         chosen["--size"] = "{}x{}".format(*settings.size)
+        text += ", images of {}×{} pixels".format(*settings.size)
+        if settings.scaled_from is not None:
+            fraction = _FRACTIONS[round(settings.scaled_from[0] / settings.size[0])]
+            scaled = [
+                f"images of {fraction} their width and height lose details, and PSNR is not comparable with that of"
+                " unscaled images; --size {}x{} keeps them".format(*settings.scaled_from)
+            ]
+    late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"
     return [
         f"{text}; this takes about {format_seconds(settings.seconds)}{late}",
+        *scaled,
         f"to repeat it: {_command(context, chosen)}",
     ]
 

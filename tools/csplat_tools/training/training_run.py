@@ -32,6 +32,7 @@ from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
 _KEEP = 0.8  # default fraction of the trained splats that a file keeps: some of them are hardly seen
+_MOST_TRAINED = 3.0  # largest number of splats that a timed training for a size chooses, by those that the file keeps
 _BRIEF_TUNING = 1 / 4  # the same of trainings so short that it is fewer than the usual steps of a tuning
 _ANNOUNCED_FROM = 100  # steps; a few are timed before longer trainings
 _MUCH_SMALLER = 0.9  # fraction of its largest size below which a file is explained
@@ -137,9 +138,16 @@ def run_training_to_file(
     return {"training": result.log, "file": report}
 
 
-def splats_for(target: Target | None) -> int | None:
-    """Return the number of splats to train for a size, a quarter more than are kept; `None` without a size."""
-    return None if target is None or target.size_bytes is None else round(_kept_for(target.size_bytes) / _KEEP)
+def splats_for(target: Target | None, *, most: bool = False) -> int | None:
+    """Return the number of splats to train for a size, a quarter more than are kept; `None` without a size.
+
+    Args:
+        target: the target of the file.
+        most: return the largest number that is of use, for a training that has the time for it.
+    """
+    if target is None or target.size_bytes is None:
+        return None
+    return round(_kept_for(target.size_bytes) * (_MOST_TRAINED if most else 1.0 / _KEEP))
 
 
 def _kept_for(size_bytes: int) -> int:
