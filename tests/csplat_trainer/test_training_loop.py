@@ -9,6 +9,7 @@ csplat_trainer.pruning.
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import signal
 from dataclasses import replace
@@ -205,7 +206,8 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path, monkeypat
     shutil.copy(file_runs.checkpoint, run)
     with monkeypatch.context() as patch:
         interrupt_after(patch, 17)
-        file_runs.made("again.csplat", "--keep", 1, "--checkpoint", run, "--resume", run, status=130)
+        _, messages = file_runs.made("again.csplat", "--keep", 1, "--checkpoint", run, "--resume", run, status=130)
+    assert f"{run} holds 30 of 30 steps, {tuning_checkpoint(run)} holds 17 of 30 steps; to continue" in messages
     for path in (run, tuning_checkpoint(run)):
         shutil.copy(path, tmp_path / path.name.replace("run", "other"))
     file_runs.made("again.csplat", "--keep", 1, "--checkpoint", run, "--resume", run)
@@ -237,14 +239,20 @@ def test_ctrl_c_leaves_a_checkpoint_beside_the_output_from_which_the_run_ends_as
     call("train", file_runs.data, whole, *words)
     with monkeypatch.context() as patch:
         interrupt_after(patch, 17)
-        messages = call("train", file_runs.data, part, *words, status=130).stderr
-    assert f"{left} holds the finished steps: --resume {left} continues from them" in messages
-    assert {whole, left} == {*tmp_path.iterdir()}
+        preview = tmp_path / "part.png"
+        messages = call("train", file_runs.data, part, *words, "--preview", preview, status=130).stderr
+    (line,) = (line for line in messages.splitlines() if f"{left} holds 17 of 30 steps; to continue: " in line)
+    continued = shlex.split(line.partition("to continue: csplat ")[2])
+    assert {whole, left, preview} == {*tmp_path.iterdir()}
     assert 17 == load_checkpoint(left).iteration
     assert "is left from an earlier run" in call("train", file_runs.data, part, *words, status=1).stderr
-    call("train", file_runs.data, part, *words, "--resume", left)
+    stopped = preview.read_bytes()
+    call(*continued)
     assert whole.read_bytes() == part.read_bytes()
-    assert {whole, part, left} == {*tmp_path.iterdir()}  # an option named it
+    assert stopped != preview.read_bytes()
+    assert {whole, part, left, preview} == {*tmp_path.iterdir()}  # an option named the checkpoint
+    again = call("train", file_runs.data, tmp_path / "b.ply", *words, "--preview", preview, status=1)
+    assert f"{preview} exists: --force replaces it" in again.stderr
 
 
 @pytest.mark.slow
@@ -266,7 +274,7 @@ def test_one_training_gives_several_files(file_runs):
     assert trained == file_runs.checkpoint.read_bytes()
     kept = file_runs.folder / "bad.csplat.npz"
     _, messages = file_runs.made("bad.csplat", "--target-size", "90B", status=1)
-    assert f"{kept} holds the finished steps" in messages  # no file is that small, but the training is worth keeping
+    assert f"{kept} holds 30 of 30 steps: --resume {kept} continues from" in messages  # for a file that is larger
     _, messages = file_runs.made("bad.csplat", "--resume", kept, "--keep", 1)
     assert kept.exists()
     kept.unlink()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -407,8 +408,30 @@ def is_same_file(a: str | None, b: str | None) -> bool:
     return a is not None and b is not None and resolve_links(a) == resolve_links(b)
 
 
+def command_line(context: typer.Context, chosen: Mapping[str, str], *omitted: str) -> str:
+    """Return the current command with its options, but with the chosen ones, and without the omitted ones.
+
+    Args:
+        context: the command's context.
+        chosen: values by option.
+        omitted: options.
+    """
+    words = ["csplat", *(["--trust-paths"] if TRUSTS_PATHS.get() else []), context.command.name or ""]
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if source is None or source.name != "COMMANDLINE":
+            continue
+        value, name = context.params.get(parameter.name or ""), parameter.opts[0]
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif name not in omitted and name not in chosen:
+            words += [name] if value is True else [name, str(value)]
+    return shlex.join([*words, *(word for pair in chosen.items() for word in pair)])
+
+
 @contextmanager
 def run_checkpoint(
+    context: typer.Context,
     checkpoint: str | None,
     resume: str | None,
     output: str,
@@ -421,6 +444,7 @@ def run_checkpoint(
     OUT.npz and further checkpoints are removed when the run has succeeded, but no file that an option names.
 
     Args:
+        context: the command's context.
         checkpoint, resume: the options.
         output: the file that the run writes.
         others: returns the paths of further checkpoints of the run, from that of the first.
@@ -445,12 +469,23 @@ def run_checkpoint(
         if is_named and is_refused:
             removed = []
         elif Path(path).exists() and (keep_refused or not is_refused):
-            note(f"{path} holds the finished steps: --resume {path} continues from them")
             removed = further if is_refused else []
+            kept = [file for file in (Path(path), *further) if file.exists() and file not in removed]
+            holds = ", ".join(map(_describe_checkpoint, kept))
+            again = command_line(context, {"--resume": path}, "--time")
+            note(f"{holds}: --resume {path} continues from them" if is_refused else f"{holds}; to continue: {again}")
         raise
     finally:
         for file in removed:
             file.unlink(missing_ok=True)
+
+
+def _describe_checkpoint(path: Path) -> str:
+    """Return the clause of messages about a checkpoint."""
+    from csplat_trainer.fit_checkpoint import count_steps
+
+    steps = count_steps(path)
+    return f"{path} holds " + ("the finished steps" if steps is None else f"{steps[0]:,} of {steps[1]:,} steps")
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:

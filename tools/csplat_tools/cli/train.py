@@ -13,7 +13,7 @@ import typer
 from csplat.context import Context
 from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
-from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
+from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_seconds, parse_seconds
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
@@ -126,7 +126,8 @@ def train(
     replaces = shared.is_same_file(checkpoint, resume)
     tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and target_psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
-    out.check(output, inputs=(source, resume), named={"--page": page, "--preview": preview, **written})
+    out.check(named={"--preview": preview}, force=resume is not None)  # of the run that is resumed
+    out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
@@ -146,7 +147,7 @@ def train(
     if to_file:
         options = plan_training(options, target, max_splats=settings.max_splats)
     kept = shared.run_checkpoint(
-        checkpoint, resume, output, lambda path: [tuning_checkpoint(path)] if to_file else [],
+        context, checkpoint, resume, output, lambda path: [tuning_checkpoint(path)] if to_file else [],
         keep_refused=resume is None,
     )  # fmt: skip
     with kept as path, out.bar() as progress:
@@ -196,20 +197,5 @@ def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Co
     return [
         f"{text}; this takes about {format_seconds(settings.seconds)}{late}",
         *scaled,
-        f"to repeat it: {_command(context, chosen)}",
+        f"to repeat it: {shared.command_line(context, chosen, '--time')}",
     ]
-
-
-def _command(context: typer.Context, chosen: dict[str, str]) -> str:
-    """Return the current command with its options, without --time, and with the chosen ones."""
-    words = ["csplat", *(["--trust-paths"] if TRUSTS_PATHS.get() else []), "train"]
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if source is None or source.name != "COMMANDLINE":
-            continue
-        value, name = context.params.get(parameter.name or ""), parameter.opts[0]
-        if parameter.param_type_name == "argument":
-            words.append(str(value))
-        elif name != "--time" and name not in chosen:
-            words += [name] if value is True else [name, str(value)]
-    return shlex.join([*words, *(word for pair in chosen.items() for word in pair)])
