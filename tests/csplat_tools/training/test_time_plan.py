@@ -84,15 +84,18 @@ def test_the_printed_command_makes_the_same_file_and_resume_takes_its_settings(t
     monkeypatch.setattr(time_plan, "_LEAST_SIDE", 8)  # the images are smaller than any that would be scaled
     monkeypatch.setattr(time_plan, "candidate_sizes", lambda sizes: candidate_sizes(sizes)[1:2])
     monkeypatch.setattr(time_plan, "_SPLATS", (500, 2000))  # seconds less
+    monkeypatch.setattr("csplat_tools.console.LONG_WORK_SECONDS", 0.0)
     options = ("--sh-degree", 0, "--target-size", "5kB", "--checkpoint", tmp_path / "run.npz")
     messages = call("train", photographs, timed, "--time", "1s", *options).stderr
     assert "images of half their width and height lose details" in messages
     assert "; --size 48x40 keeps them\n" in messages
+    assert 1 == messages.count("takes about")  # the plan, but neither training nor tuning
     (line,) = (line for line in messages.splitlines() if line.startswith("to repeat it: csplat train "))
     words = shlex.split(line.removeprefix("to repeat it: csplat "))
     assert {"--max-splats", "--iterations", "--size"} <= {*words}
     assert "--time" not in words
-    call(*[str(again) if word == str(timed) else word for word in words], "--force")
+    messages = call(*[str(again) if word == str(timed) else word for word in words], "--force").stderr
+    assert "training takes about" in messages
     assert timed.read_bytes() == again.read_bytes()
     call("train", photographs, resumed, "--resume", tmp_path / "run.npz", *options[:4])
     assert timed.read_bytes() == resumed.read_bytes()

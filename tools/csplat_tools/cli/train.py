@@ -152,15 +152,17 @@ def train(
     )  # fmt: skip
     with kept as path, out.bar() as progress:
         files, run = Outputs(path, preview=preview, resume=resume), Context(seed=seed, progress=progress)
+        expected = settings.seconds or None
         if to_file:
             result = run_training_to_file(
                 data, output, options, files, encoding, tuning_after(training=options), target=target,
-                overrides=overrides, page=page, context=run, quiet=out.quiet,
+                overrides=overrides, page=page, expected=expected, context=run, quiet=out.quiet,
             )  # fmt: skip
         else:
             result = run_training(
-                data, output, options, files, overrides=overrides, page=page, context=run, quiet=out.quiet
-            )
+                data, output, options, files, overrides=overrides, page=page, expected=expected, context=run,
+                quiet=out.quiet,
+            )  # fmt: skip
     if to_file:
         out.remark(format_tuning_report(result["file"]), *explain_size(result, target))
         out.remark(_describe_next_steps(output, checkpoint or resume))
