@@ -326,7 +326,10 @@ def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_train
     for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
         refused = call("train", tmp_path, tmp_path / "a.ply", *words, status=2).stderr
         assert "expected OUT.csplat" in " ".join(refused.split())
-    assert [] == [*tmp_path.glob("a.*")]
+    for name in ("a", "a.", "a.v2"):
+        refused = call("train", tmp_path, tmp_path / name, status=2).stderr
+        assert "ends in neither .ply nor .csplat, expected OUT.ply or OUT.csplat" in " ".join(refused.split())
+    assert [] == [*tmp_path.glob("a*")]
 
 
 def test_a_checkpoint_is_loaded_and_adapts_to_other_options_and_is_refused_in_another_version(make_model, tmp_path):

@@ -15,7 +15,7 @@ from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_seconds, parse_seconds
-from csplat_tools.file_streams import check_name
+from csplat_tools.file_streams import check_name, is_one_way
 from csplat_tools.optional_packages import require_trainer
 from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
@@ -92,7 +92,8 @@ def train(
       csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
     out = Output(force, report, as_json, quiet)
-    to_file = Path(output).suffix == ".csplat"
+    ending = Path(output).suffix.lower()
+    to_file = ending == ".csplat"
     targets = {"--keep": keep, "--target-size": target_size, "--target-psnr": target_psnr}
     shared.refuse_together(targets)
     for name, value in {"--preset": preset, **targets}.items():
@@ -130,6 +131,8 @@ def train(
     out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
+        if ending != ".ply" and not is_one_way(output):
+            raise typer.BadParameter(f"{output} ends in neither .ply nor .csplat, expected OUT.ply or OUT.csplat")
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
     data = shared.open_data(source, size=pixels, test_every=test_every)
     settings = TrainingSettings(pixels, options.max_splats, options.iterations)
