@@ -246,6 +246,8 @@ def test_ctrl_c_leaves_a_checkpoint_beside_the_output_from_which_the_run_ends_as
     assert {whole, left, preview} == {*tmp_path.iterdir()}
     assert 17 == load_checkpoint(left).iteration
     assert "is left from an earlier run" in call("train", file_runs.data, part, *words, status=1).stderr
+    both = ("--resume", left, "--preview", tmp_path / "p", "--report", tmp_path / "p")
+    assert "is given for two outputs" in call("train", file_runs.data, part, *words, *both, status=1).stderr
     stopped = preview.read_bytes()
     call(*continued)
     assert whole.read_bytes() == part.read_bytes()

@@ -127,8 +127,11 @@ def train(
     replaces = shared.is_same_file(checkpoint, resume)
     tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and target_psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
-    out.check(named={"--preview": preview}, force=resume is not None)  # of the run that is resumed
-    out.check(output, inputs=(source, resume), named={"--page": page, **written})
+    named = {"--page": page, "--preview": preview, **written}
+    if resume is not None:  # a resumed run renews its preview
+        out.check(output, inputs=(source, resume), named=named, force=True)
+        del named["--preview"]
+    out.check(output, inputs=(source, resume), named=named)
     if not to_file:
         check_name(output, ".ply", "train", source)
         if ending != ".ply" and not is_one_way(output):
