@@ -2,6 +2,7 @@
 """Progress display: when it is shown, how often, and its text. The tests control the clock."""
 
 import io
+import itertools
 import sys
 from types import SimpleNamespace
 
@@ -11,6 +12,8 @@ from csplat.errors import InputError
 from csplat.types import null_progress
 from csplat_tools import console
 from csplat_tools.console import Display, displayed, progress_bar, step_progress
+from csplat_tools.training.tuning_report import describe_step
+from csplat_trainer.fitter import FitStep
 
 
 class Terminal(io.StringIO):
@@ -101,6 +104,39 @@ def test_an_expected_time_is_announced_before_the_first_step_and_again_if_the_ru
     assert "training takes longer than that here: about 59 s from now\n" == capsys.readouterr().err
     with step_progress("training", lambda _: "", expected=100.0, quiet=True):
         assert "" == capsys.readouterr().err
+
+
+def test_another_run_has_its_own_time_and_an_announced_time_is_not_announced_again(clock, capsys):
+    for options, announced in (
+        ({}, ["tuning takes about 23 to 44 s from here", "another tuning takes about 23 to 44 s from here"]),
+        ({"announced": True}, []), ({"announced": True, "expected": 40.0}, []),
+    ):  # fmt: skip
+        with step_progress("tuning", lambda _: "", clock=clock, **options) as show:
+            for _ in range(2):
+                clock.now += 60.0  # choosing splats
+                for before, iteration in itertools.pairwise((0, 2, 10, 30, 200, 375)):
+                    clock.now += 0.08 * (iteration - before)
+                    show(SimpleNamespace(iteration=iteration, iterations=375))
+        assert announced == capsys.readouterr().err.splitlines()
+    with step_progress("training", lambda _: "", expected=40.0, announced=True, clock=clock) as show:
+        for iteration in range(0, 100, 10):
+            show(SimpleNamespace(iteration=iteration, iterations=100))
+            clock.now += 30.0
+    assert "training takes longer than that here: about 4 minutes from now\n" == capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size_bytes", [None, 149_700])
+def test_a_terminal_of_eighty_columns_shows_the_time_left_of_a_training(clock, monkeypatch, size_bytes):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "xterm")
+    now = FitStep(12_300, 30_000, 0.0243, 31.17, 1_500_000, 3, 3600.0, 7200.0, size_bytes)
+    with displayed(Display(terminal=True, clock=clock)) as display:
+        display.report("training", 0.4, describe_step(now))
+        clock.now += 3.0
+        display.tick()
+        assert "2 h 0 min left" in sys.stderr.getvalue()
+        assert "1,500,000 splats" in sys.stderr.getvalue()
 
 
 def test_a_terminal_shows_bars_after_two_seconds_and_removes_them_before_other_output(clock, monkeypatch, capsys):

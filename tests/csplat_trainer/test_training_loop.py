@@ -9,6 +9,7 @@ csplat_trainer.pruning.
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import signal
 from dataclasses import replace
@@ -26,7 +27,7 @@ from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_render.camera import Camera, relative_to
-from csplat_tools.training.training_run import explain_size, plan_training, tuning_after
+from csplat_tools.training.training_run import explain_size, plan_training, tuning_after, tuning_checkpoint
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
@@ -190,7 +191,7 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
 
 
 @pytest.mark.slow
-def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
+def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path, monkeypatch):
     first, report = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
     model = decode(first)
     assert 30 == len(report["training"]["losses"])
@@ -200,14 +201,33 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
     record = model.metadata.training
     assert (1.0, 1.0, 1.0) == record.background
     assert str(record) in call("info", file_runs.folder / "a.csplat").stdout
-    for name in ("run.npz", "run.tuning.npz"):
-        shutil.copy(file_runs.folder / name, tmp_path / name)
-    files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
-    file_runs.made("again.csplat", *files)
-    file_runs.made("further.csplat", *files, "--iterations", 40)
+    assert not (file_runs.folder / "run.tuning.npz").exists()
+    run, other = tmp_path / "run.npz", tmp_path / "other.npz"
+    shutil.copy(file_runs.checkpoint, run)
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 17)
+        _, messages = file_runs.made("again.csplat", "--keep", 1, "--checkpoint", run, "--resume", run, status=130)
+    assert f"{run} holds 30 of 30 steps, {tuning_checkpoint(run)} holds 17 of 30 steps; to continue" in messages
+    for path in (run, tuning_checkpoint(run)):
+        shutil.copy(path, tmp_path / path.name.replace("run", "other"))
+    file_runs.made("again.csplat", "--keep", 1, "--checkpoint", run, "--resume", run)
+    file_runs.made("further.csplat", "--keep", 1, "--checkpoint", other, "--resume", other, "--iterations", 40)
+    assert {run, other} == {*tmp_path.iterdir()}
     again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("again", "further"))
     assert first == again
     assert first != further  # another scene: the existing tuning does not apply
+
+
+def interrupt_after(patch, iteration):
+    """Let Ctrl-C interrupt trainings and tunings after a step."""
+    step = Fitter.step
+
+    def interrupted(fitter, fit):
+        step(fitter, fit)
+        if fitter.iteration == iteration:
+            signal.raise_signal(signal.SIGINT)
+
+    patch.setattr(Fitter, "step", interrupted)
 
 
 @pytest.mark.slow
@@ -217,28 +237,31 @@ def test_ctrl_c_leaves_a_checkpoint_beside_the_output_from_which_the_run_ends_as
     whole, part = tmp_path / "whole.ply", tmp_path / "part.ply"
     words, left = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30), tmp_path / "part.ply.npz"
     call("train", file_runs.data, whole, *words)
-    step = Fitter.step
-
-    def interrupted(fitter, fit):
-        step(fitter, fit)
-        if fitter.iteration == 17:
-            signal.raise_signal(signal.SIGINT)
-
     with monkeypatch.context() as patch:
-        patch.setattr(Fitter, "step", interrupted)
-        messages = call("train", file_runs.data, part, *words, status=130).stderr
-    assert f"{left} holds the finished steps: --resume {left} continues from them" in messages
-    assert {whole, left} == {*tmp_path.iterdir()}
+        interrupt_after(patch, 17)
+        preview = tmp_path / "part.png"
+        messages = call("train", file_runs.data, part, *words, "--preview", preview, status=130).stderr
+    (line,) = (line for line in messages.splitlines() if f"{left} holds 17 of 30 steps; to continue: " in line)
+    continued = shlex.split(line.partition("to continue: csplat ")[2])
+    assert {whole, left, preview} == {*tmp_path.iterdir()}
     assert 17 == load_checkpoint(left).iteration
-    assert "is left from an interrupted run" in call("train", file_runs.data, part, *words, status=1).stderr
-    call("train", file_runs.data, part, *words, "--resume", left)
+    assert "is left from an earlier run" in call("train", file_runs.data, part, *words, status=1).stderr
+    both = ("--resume", left, "--preview", tmp_path / "p", "--report", tmp_path / "p")
+    assert "is given for two outputs" in call("train", file_runs.data, part, *words, *both, status=1).stderr
+    stopped = preview.read_bytes()
+    call(*continued)
     assert whole.read_bytes() == part.read_bytes()
-    assert {whole, part} == {*tmp_path.iterdir()}
+    assert stopped != preview.read_bytes()
+    assert {whole, part, left, preview} == {*tmp_path.iterdir()}  # an option named the checkpoint
+    again = call("train", file_runs.data, tmp_path / "b.ply", *words, "--preview", preview, status=1)
+    assert f"{preview} exists: --force replaces it" in again.stderr
 
 
 @pytest.mark.slow
 def test_one_training_gives_several_files(file_runs):
     trained, usual = file_runs.checkpoint.read_bytes(), file_runs.report["file"]
+    resume = f"`--resume {file_runs.checkpoint} --target-size …` makes other sizes"
+    assert f"`csplat view {file_runs.folder / 'a.csplat'}` shows it; {resume}\n" in file_runs.messages
 
     def made(name, *more, **options):
         return file_runs.made(name, "--resume", file_runs.checkpoint, *more, **options)[0]["file"]
@@ -251,6 +274,15 @@ def test_one_training_gives_several_files(file_runs):
     good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
     assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.05
     assert trained == file_runs.checkpoint.read_bytes()
+    kept = file_runs.folder / "bad.csplat.npz"
+    _, messages = file_runs.made("bad.csplat", "--target-size", "90B", status=1)
+    assert f"{kept} holds 30 of 30 steps: --resume {kept} continues from" in messages  # for a file that is larger
+    _, messages = file_runs.made("bad.csplat", "--resume", kept, "--keep", 1)
+    assert kept.exists()
+    kept.unlink()
+    _, messages = file_runs.made("unnamed.csplat", "--keep", 1)
+    assert "; with `--checkpoint run.npz`, `--resume run.npz --target-size …` makes other sizes of a" in messages
+    assert [] == [*file_runs.folder.glob("unnamed.csplat*.npz")]
 
 
 def test_a_training_is_planned_by_its_target_and_its_tuning_by_its_length():
@@ -296,7 +328,10 @@ def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_train
     for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
         refused = call("train", tmp_path, tmp_path / "a.ply", *words, status=2).stderr
         assert "expected OUT.csplat" in " ".join(refused.split())
-    assert [] == [*tmp_path.glob("a.*")]
+    for name in ("a", "a.", "a.v2"):
+        refused = call("train", tmp_path, tmp_path / name, status=2).stderr
+        assert "ends in neither .ply nor .csplat, expected OUT.ply or OUT.csplat" in " ".join(refused.split())
+    assert [] == [*tmp_path.glob("a*")]
 
 
 def test_a_checkpoint_is_loaded_and_adapts_to_other_options_and_is_refused_in_another_version(make_model, tmp_path):

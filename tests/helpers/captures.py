@@ -241,8 +241,8 @@ class FileRuns:
         outputs = ("--checkpoint", self.checkpoint, "--page", self.page)
         self.report, self.messages = self.made("a.csplat", "--keep", 1, *outputs)
 
-    def made(self, name, *more, **options):
-        """Make a file or a PLY, with options of the training; return the report and the messages."""
+    def made(self, name, *more, status=0, **options):
+        """Make a file or a PLY, with options of the training; return the report, if there is one, and the messages."""
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
             change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
@@ -250,8 +250,8 @@ class FileRuns:
             brief = lambda **given: replace(tuning_after(**given), iterations=self.TUNED)  # noqa: E731
             patch.setattr(training_run, "tuning_after", brief)
             words = ("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
-            messages = call(*words).stderr
-        return json.loads(report.read_text()), messages
+            messages = call(*words, status=status).stderr
+        return None if status else json.loads(report.read_text()), messages
 
 
 def shell_with_hidden_splats():

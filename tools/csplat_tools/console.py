@@ -32,7 +32,7 @@ _TICK = 0.2  # seconds between updates of the display
 _ESTIMATE_FROM = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
 _TIMED_REPORTS = 2  # number of reports of a long run after which its time is estimated
 _RUN_RANGE = (0.8, 1.5)  # range of the estimate of a run, as factors
-_SURE_SECONDS = 20.0  # time after which a run's own steps overrule the estimate
+_SURE_SECONDS = 20.0  # time of a run's own steps after which they overrule the estimate
 _RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
 _STAGES = 2  # stages shown at a time: the last that were reported
 _WORKING = "working"  # shown if no stage is known
@@ -104,6 +104,7 @@ def step_progress(
     describe: Callable[[S], str],
     *,
     expected: float | None = None,
+    announced: bool = False,
     quiet: bool = False,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Callable[[S], None] | None]:
@@ -113,23 +114,28 @@ def step_progress(
         name: name of the run.
         describe: returns a line on the state of the run and the time left.
         expected: expected time of the run, seconds; `None`: it is estimated from the first reports.
+        announced: the time has been announced, perhaps as a part of that of a longer run.
         quiet: show nothing.
         clock: returns seconds.
 
     Yields:
-        A callback for each step; `None` if nothing is shown.
+        A callback for each step; `None` if nothing is shown. Fewer steps than before begin another run.
     """
     reports: list[tuple[float, int]] = []
-    begun, most = clock(), math.inf if expected is None or quiet else _announce(name, expected)
+    unknown, subject = math.inf if announced else None, name
+    most = unknown if expected is None else _announce(name, expected, quiet=quiet or announced)
 
     def show(now: S) -> None:
-        nonlocal most
+        nonlocal most, subject
+        if reports and now.iteration < reports[-1][1]:
+            reports.clear()
+            most, subject = unknown, f"another {name}"
         reports.append((clock(), now.iteration))
         if len(reports) >= _TIMED_REPORTS:  # the first steps are slower, since they load and compile
-            (first_seconds, first), (seconds, last) = reports[0], reports[-1]
-            left = (seconds - first_seconds) / max(1, last - first) * (now.iterations - last)
-            if expected is None and len(reports) == _TIMED_REPORTS:
-                most = seconds - begun + _announce(name, left, " from here")
+            (begun, first), (seconds, last) = reports[0], reports[-1]
+            left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
+            if most is None:
+                most = seconds - begun + _announce(subject, left, " from here")
             elif left > LONG_WORK_SECONDS and seconds - begun > _SURE_SECONDS and seconds - begun + left > most:
                 note(f"{name} takes longer than that here: about {format_seconds(left)} from now")
                 most = _RUN_RANGE[1] * (seconds - begun + left)
@@ -140,9 +146,9 @@ def step_progress(
         yield None if display is None else show
 
 
-def _announce(name: str, seconds: float, suffix: str = "") -> float:
+def _announce(name: str, seconds: float, suffix: str = "", *, quiet: bool = False) -> float:
     """Announce the expected time of a run, unless it is short; return the upper end of the announced range, seconds."""
-    if seconds > LONG_WORK_SECONDS:
+    if seconds > LONG_WORK_SECONDS and not quiet:
         note(f"{name} takes about {format_range(_RUN_RANGE[0] * seconds, _RUN_RANGE[1] * seconds)}{suffix}")
     return max(LONG_WORK_SECONDS, _RUN_RANGE[1] * seconds)
 

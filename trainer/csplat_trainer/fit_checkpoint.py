@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.archives import read_archive
-from csplat.disk_files import atomic_writer
+from csplat.archives import DAMAGED, read_archive
+from csplat.disk_files import atomic_writer, parse_json
 from csplat.errors import InputError
 from csplat.types import F32
 from csplat_trainer.parameters import Parameters
@@ -98,6 +98,19 @@ def load_checkpoint(path: str | Path, kind: Kind = "train") -> FitCheckpoint:
         check_arrays(path, moments, {name: array.shape for name, array in values.items()})
     parameters = Parameters(values, first, second, facts["step"])
     return FitCheckpoint(**{name: facts[name] for name in _FACTS}, parameters=parameters, arrays=dict(stored))
+
+
+def count_steps(path: str | Path) -> tuple[int, int] | None:
+    """Return the number of finished steps of a checkpoint, and of all steps; `None` if it has neither.
+
+    Only these facts are read, not the parameters.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            facts = parse_json(archive["facts"].tobytes())
+        return int(facts["iteration"]), int(facts["options"]["iterations"])
+    except DAMAGED:
+        return None
 
 
 def check_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:

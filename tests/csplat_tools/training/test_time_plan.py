@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 import shlex
+from unittest.mock import Mock
 
 import pytest
 from captures import write_photographs
 from command_line import call
 
+from csplat.encoder import Target
+from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_tools.training import time_plan
 from csplat_tools.training.time_plan import StepCost, candidate_sizes, choose_settings, expected_loss
+from csplat_tools.training.training_run import plan_training
+from csplat_trainer.training_options import TrainOptions
 
 COST = StepCost(1e-3, 5e-8, 3e-7, 1e-12)  # seconds; about that of two cores
 PHOTOGRAPHS = (960, 540)
@@ -38,13 +43,13 @@ def test_more_time_gives_a_better_training_within_the_time():
         pixels = 1.0 if plan.size is None else plan.size[0] * plan.size[1] / (960 * 540)
         losses.append(expected_loss(pixels, plan.max_splats, plan.iterations))
     assert sorted(losses, reverse=True) == losses
-    assert (None, 30_000) == (plan.size, plan.iterations)  # more steps are not worth their time
+    assert (None, None, 30_000) == (plan.size, plan.scaled_from, plan.iterations)  # more steps are not worth their time
     assert plan.seconds < 36_000.0
 
 
 def test_large_images_are_scaled_down_and_slow_machines_train_less():
     plan = chosen(600.0, unscaled=(4000, 3000))
-    assert (1000, 750) == plan.size
+    assert ((1000, 750), (4000, 3000)) == (plan.size, plan.scaled_from)
     assert plan.max_splats <= 0.5 * 1000 * 750
     slow = StepCost(*(20.0 * part for part in (COST.base, COST.per_pixel, COST.per_splat, COST.per_both)))
     fast, late = chosen(1800.0), chosen(1800.0, cost=slow)
@@ -79,16 +84,31 @@ def test_the_printed_command_makes_the_same_file_and_resume_takes_its_settings(t
     monkeypatch.setattr(time_plan, "_LEAST_SIDE", 8)  # the images are smaller than any that would be scaled
     monkeypatch.setattr(time_plan, "candidate_sizes", lambda sizes: candidate_sizes(sizes)[1:2])
     monkeypatch.setattr(time_plan, "_SPLATS", (500, 2000))  # seconds less
+    monkeypatch.setattr("csplat_tools.console.LONG_WORK_SECONDS", 0.0)
     options = ("--sh-degree", 0, "--target-size", "5kB", "--checkpoint", tmp_path / "run.npz")
     messages = call("train", photographs, timed, "--time", "1s", *options).stderr
+    assert "images of half their width and height lose details" in messages
+    assert "; --size 48x40 keeps them\n" in messages
+    assert 1 == messages.count("takes about")  # the plan, but neither training nor tuning
     (line,) = (line for line in messages.splitlines() if line.startswith("to repeat it: csplat train "))
     words = shlex.split(line.removeprefix("to repeat it: csplat "))
     assert {"--max-splats", "--iterations", "--size"} <= {*words}
     assert "--time" not in words
-    call(*[str(again) if word == str(timed) else word for word in words], "--force")
+    messages = call(*[str(again) if word == str(timed) else word for word in words], "--force").stderr
+    assert "training takes about" in messages
     assert timed.read_bytes() == again.read_bytes()
     call("train", photographs, resumed, "--resume", tmp_path / "run.npz", *options[:4])
     assert timed.read_bytes() == resumed.read_bytes()
+
+
+def test_a_timed_training_for_a_size_may_have_three_times_the_splats_that_the_file_keeps(tmp_path, monkeypatch):
+    write_photographs(tmp_path)
+    plan = Mock(side_effect=InputError("planned"))
+    monkeypatch.setattr(time_plan, "plan_in_time", plan)
+    call("train", tmp_path, tmp_path / "a.csplat", "--target-size", "80kB", status=1)
+    assert 24_000 == plan.call_args.kwargs["most_splats"]
+    options = plan_training(TrainOptions(), Target(size=80_000), max_splats=24_000)
+    assert 8_000 == pytest.approx(24_000 * options.final_share)
 
 
 @pytest.mark.slow

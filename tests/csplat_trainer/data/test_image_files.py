@@ -78,8 +78,8 @@ def test_names_of_a_list_are_matched_together():
 @pytest.mark.parametrize(
     ("name", "folder", "note"),
     [
-        ("im {:03}.png", "Images", "images from Images"), ("im {:03}.png", "images_2", "images from images_2"),
-        ("im {:03}.png", "input", "images from input"), ("im {:03}.png", ".", "images from the folder itself"),
+        ("im {:03}.png", "Images", "image folder: Images"), ("im {:03}.png", "images_2", "image folder: images_2"),
+        ("im {:03}.png", "input", "image folder: input"), ("im {:03}.png", ".", "image folder: that of the set"),
         ("im {:03}.png", "images/deeper", "9 names of images.txt found in folders below"),
         ("D:\\photos\\im {:03}.jpg", "images", "9 names of images.txt found"), ("./im {:03}.png", "images", "images"),
     ],

@@ -312,7 +312,7 @@ def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
         (None, "images"), ((48, 32), "images_2"), ((40, 30), "images_2"), ((96, 64), "images"), ((12, 8), "images_4"),
     ):  # fmt: skip
         data, wanted = load(tmp_path, size), size or (96, 64)
-        assert f"images from {folder}" in data.report
+        assert f"image folder: {folder}" in data.report
         assert wanted == (data.train[0].camera.W, data.train[0].camera.H) == data.train[0].pixels.shape[1::-1]
         assert np.allclose(np.diag([wanted[0] / 96, wanted[1] / 64, 1]) @ shots[0].K, data.train[0].camera.K)
     named = load(tmp_path, images="images_4")
@@ -329,7 +329,7 @@ def test_a_folder_of_images_may_be_given_for_its_set(tmp_path, monkeypatch):
     for path, images in (("garden/images", "images"), ("garden/small/images_2", "small/images_2"), ("garden", None)):
         data = load(path)
         assert (images, "COLMAP set garden") == (data.images, data.name)
-        assert f"images from {images or 'images'}" in data.report
+        assert f"image folder: {images or 'images'}" in data.report
     assert_refused(r"garden/images_4 is neither a folder .*; garden has images, small", "garden/images_4")
     assert_refused(r"garden/sparse is not a data set: .* or a folder of images of such a set", "garden/sparse")
     (tmp_path / "garden" / "images" / "transforms.json").write_text("{}")  # a set of its own

@@ -19,6 +19,7 @@ from csplat_tools.scene_files import MetadataOverrides, read_source, with_first_
 
 
 def finetune(
+    context: typer.Context,
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write.")],
     data: shared.Data = None,
@@ -89,7 +90,7 @@ def finetune(
         named["--checkpoint"] = checkpoint
     out.check(output, inputs=(source, *views.inputs, resume), named=named)
     check_name(output, ".csplat", "finetune", source)
-    kept = nullcontext() if target_psnr is not None else shared.run_checkpoint(checkpoint, resume, output)
+    kept = nullcontext() if target_psnr is not None else shared.run_checkpoint(context, checkpoint, resume, output)
     with kept as path, out.bar() as progress:
         scene = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
         out.print_findings(scene.findings)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -21,7 +22,7 @@ import typer
 from csplat._spec import MEASURE_NAMES
 from csplat.disk_files import resolve_links
 from csplat.encoder import PresetName, Target
-from csplat.errors import InputError
+from csplat.errors import CsplatError, InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.scene_metadata import Direction, check_axes, unit_up
 from csplat_render import Backend, Mode
@@ -409,38 +410,84 @@ def is_same_file(a: str | None, b: str | None) -> bool:
     return a is not None and b is not None and resolve_links(a) == resolve_links(b)
 
 
-@contextmanager
-def run_checkpoint(
-    checkpoint: str | None, resume: str | None, output: str, others: Callable[[str], Sequence[Path]] = lambda _: ()
-) -> Iterator[str | None]:
-    """Yield the path of a run's checkpoint: that of --checkpoint, or OUT.npz, which only an interrupted run leaves.
+def command_line(context: typer.Context, chosen: Mapping[str, str], *omitted: str) -> str:
+    """Return the current command with its options, but with the chosen ones, and without the omitted ones.
 
     Args:
+        context: the command's context.
+        chosen: values by option.
+        omitted: options.
+    """
+    words = ["csplat", *(["--trust-paths"] if TRUSTS_PATHS.get() else []), context.command.name or ""]
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if source is None or source.name != "COMMANDLINE":
+            continue
+        value, name = context.params.get(parameter.name or ""), parameter.opts[0]
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif name not in omitted and name not in chosen:
+            words += [name] if value is True else [name, str(value)]
+    return shlex.join([*words, *(word for pair in chosen.items() for word in pair)])
+
+
+@contextmanager
+def run_checkpoint(
+    context: typer.Context,
+    checkpoint: str | None,
+    resume: str | None,
+    output: str,
+    others: Callable[[str], Sequence[Path]] = lambda _: (),
+    *,
+    keep_refused: bool = False,
+) -> Iterator[str | None]:
+    """Yield the path of a run's checkpoint: that of --checkpoint, or OUT.npz.
+
+    OUT.npz and further checkpoints are removed when the run has succeeded, but no file that an option names.
+
+    Args:
+        context: the command's context.
         checkpoint, resume: the options.
         output: the file that the run writes.
         others: returns the paths of further checkpoints of the run, from that of the first.
+        keep_refused: keep OUT.npz of a run that is refused after some steps, as for a target that it cannot meet.
 
     Raises:
-        InputError: an interrupted run has left OUT.npz, and --resume does not name it.
+        InputError: an earlier run has left OUT.npz, and --resume does not name it.
     """
     path = checkpoint if checkpoint is not None or output == STANDARD_STREAM else f"{output}.npz"
     if path is None:
         yield None
         return
-    is_own = checkpoint is None
-    if is_own and Path(path).exists() and not is_same_file(path, resume):
-        raise InputError(f"{path} is left from an interrupted run: continue with --resume {path}, or remove it")
-    is_over = True
+    is_named = checkpoint is not None or is_same_file(path, resume)
+    if not is_named and Path(path).exists():
+        raise InputError(f"{path} is left from an earlier run: continue with --resume {path}, or remove it")
+    further = [*others(path)]
+    removed = further if is_named else [Path(path), *further]
     try:
         yield path
-    except (KeyboardInterrupt, SystemExit, OSError, MemoryError):
-        is_over = not Path(path).exists()
-        if not is_over:
-            note(f"{path} holds the finished steps: --resume {path} continues from them")
+    except BaseException as error:
+        is_refused = isinstance(error, CsplatError)
+        if is_named and is_refused:
+            removed = []
+        elif Path(path).exists() and (keep_refused or not is_refused):
+            removed = further if is_refused else []
+            kept = [file for file in (Path(path), *further) if file.exists() and file not in removed]
+            holds = ", ".join(map(_describe_checkpoint, kept))
+            again = command_line(context, {"--resume": path}, "--time")
+            note(f"{holds}: --resume {path} continues from them" if is_refused else f"{holds}; to continue: {again}")
         raise
     finally:
-        for file in (Path(path), *others(path)) if is_own and is_over else ():
+        for file in removed:
             file.unlink(missing_ok=True)
+
+
+def _describe_checkpoint(path: Path) -> str:
+    """Return the clause of messages about a checkpoint."""
+    from csplat_trainer.fit_checkpoint import count_steps
+
+    steps = count_steps(path)
+    return f"{path} holds " + ("the finished steps" if steps is None else f"{steps[0]:,} of {steps[1]:,} steps")
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:

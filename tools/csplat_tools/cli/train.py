@@ -13,9 +13,9 @@ import typer
 from csplat.context import Context
 from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
-from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
+from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_seconds, parse_seconds
-from csplat_tools.file_streams import check_name
+from csplat_tools.file_streams import check_name, is_one_way
 from csplat_tools.optional_packages import require_trainer
 from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
@@ -24,6 +24,7 @@ _BACKGROUNDS = ", ".join(BACKGROUNDS)
 if TYPE_CHECKING:
     from csplat_tools.training.time_plan import TrainingSettings
 
+_FRACTIONS = {2: "half", 4: "a quarter of", 8: "an eighth of"}  # of the width of images, by how many times less it is
 _HOUR = 3600.0  # seconds, the default of --time
 
 
@@ -91,7 +92,8 @@ def train(
       csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
     out = Output(force, report, as_json, quiet)
-    to_file = Path(output).suffix == ".csplat"
+    ending = Path(output).suffix.lower()
+    to_file = ending == ".csplat"
     targets = {"--keep": keep, "--target-size": target_size, "--target-psnr": target_psnr}
     shared.refuse_together(targets)
     for name, value in {"--preset": preset, **targets}.items():
@@ -125,9 +127,15 @@ def train(
     replaces = shared.is_same_file(checkpoint, resume)
     tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and target_psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
-    out.check(output, inputs=(source, resume), named={"--page": page, "--preview": preview, **written})
+    named = {"--page": page, "--preview": preview, **written}
+    if resume is not None:  # a resumed run renews its preview
+        out.check(output, inputs=(source, resume), named=named, force=True)
+        del named["--preview"]
+    out.check(output, inputs=(source, resume), named=named)
     if not to_file:
         check_name(output, ".ply", "train", source)
+        if ending != ".ply" and not is_one_way(output):
+            raise typer.BadParameter(f"{output} ends in neither .ply nor .csplat, expected OUT.ply or OUT.csplat")
     encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
     data = shared.open_data(source, size=pixels, test_every=test_every)
     settings = TrainingSettings(pixels, options.max_splats, options.iterations)
@@ -136,55 +144,66 @@ def train(
     elif iterations is None:
         with out.bar() as progress:
             settings = plan_in_time(
-                data, options, seconds, to_file=to_file, max_splats=max_splats, most_splats=splats_for(target),
-                context=Context(seed=seed, progress=progress),
+                data, options, seconds, to_file=to_file, max_splats=max_splats,
+                most_splats=splats_for(target, most=True), context=Context(seed=seed, progress=progress),
             )  # fmt: skip
         out.remark(*_describe_plan(settings, seconds, context))
     data = replace(data, size=settings.size)
     options = replace(options, max_splats=settings.max_splats, iterations=settings.iterations)
     if to_file:
         options = plan_training(options, target, max_splats=settings.max_splats)
-    kept = shared.run_checkpoint(checkpoint, resume, output, lambda path: [tuning_checkpoint(path)])
+    kept = shared.run_checkpoint(
+        context, checkpoint, resume, output, lambda path: [tuning_checkpoint(path)] if to_file else [],
+        keep_refused=resume is None,
+    )  # fmt: skip
     with kept as path, out.bar() as progress:
         files, run = Outputs(path, preview=preview, resume=resume), Context(seed=seed, progress=progress)
+        expected = settings.seconds or None
         if to_file:
             result = run_training_to_file(
                 data, output, options, files, encoding, tuning_after(training=options), target=target,
-                overrides=overrides, page=page, context=run, quiet=out.quiet,
+                overrides=overrides, page=page, expected=expected, context=run, quiet=out.quiet,
             )  # fmt: skip
         else:
             result = run_training(
-                data, output, options, files, overrides=overrides, page=page, context=run, quiet=out.quiet
-            )
+                data, output, options, files, overrides=overrides, page=page, expected=expected, context=run,
+                quiet=out.quiet,
+            )  # fmt: skip
     if to_file:
         out.remark(format_tuning_report(result["file"]), *explain_size(result, target))
+        out.remark(_describe_next_steps(output, checkpoint or resume))
     out.publish(result)
+
+
+def _describe_next_steps(output: str, checkpoint: str | None) -> str:
+    """Return a line on what to do with a file, and how to make others of the same training.
+
+    Args:
+        output: the file.
+        checkpoint: the checkpoint that the run leaves; `None`: it is removed.
+    """
+    other_sizes = f"`--resume {shlex.quote(checkpoint or 'run.npz')} --target-size …` makes other sizes"
+    if checkpoint is None:
+        other_sizes = f"with `--checkpoint run.npz`, {other_sizes} of a training"
+    return f"`csplat view {shlex.quote(output)}` shows it; {other_sizes}"
 
 
 def _describe_plan(settings: TrainingSettings, seconds: float, context: typer.Context) -> list[str]:
     """Return lines on the settings of a timed training, and the command that repeats it."""
-    size = "" if settings.size is None else ", images of {}×{} pixels".format(*settings.size)
-    text = f"{settings.max_splats:,} splats, {settings.iterations:,} steps{size}"
-    late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"
+    text, scaled = f"{settings.max_splats:,} splats, {settings.iterations:,} steps", []
     chosen = {"--max-splats": str(settings.max_splats), "--iterations": str(settings.iterations)}
     if settings.size is not None:
         chosen["--size"] = "{}x{}".format(*settings.size)
+        text += ", images of {}×{} pixels".format(*settings.size)
+        if settings.scaled_from is not None:
+            fraction = _FRACTIONS[round(settings.scaled_from[0] / settings.size[0])]
+            scaled = [
+                f"images of {fraction} their width and height lose details, and PSNR is not comparable with that of"
+                " unscaled images; --size {}x{} keeps them".format(*settings.scaled_from)
+            ]
+    late = "" if settings.seconds <= seconds else f", more than {format_seconds(seconds)}: --size makes images smaller"
     return [
         f"{text}; this takes about {format_seconds(settings.seconds)}{late}",
-        f"to repeat it: {_command(context, chosen)}",
+        *scaled,
+        f"to repeat it: {shared.command_line(context, chosen, '--time')}",
     ]
-
-
-def _command(context: typer.Context, chosen: dict[str, str]) -> str:
-    """Return the current command with its options, without --time, and with the chosen ones."""
-    words = ["csplat", *(["--trust-paths"] if TRUSTS_PATHS.get() else []), "train"]
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if source is None or source.name != "COMMANDLINE":
-            continue
-        value, name = context.params.get(parameter.name or ""), parameter.opts[0]
-        if parameter.param_type_name == "argument":
-            words.append(str(value))
-        elif name != "--time" and name not in chosen:
-            words += [name] if value is True else [name, str(value)]
-    return shlex.join([*words, *(word for pair in chosen.items() for word in pair)])

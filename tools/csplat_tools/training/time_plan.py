@@ -79,12 +79,14 @@ class TrainingSettings:
         size: width and height that images are scaled to; `None`: unscaled.
         max_splats, iterations: as in `TrainOptions`.
         seconds: expected time of the whole run; 0: unknown.
+        scaled_from: width and height of the images, if the time was too short for them; otherwise `None`.
     """
 
     size: tuple[int, int] | None
     max_splats: int
     iterations: int
     seconds: float = 0.0
+    scaled_from: tuple[int, int] | None = None
 
 
 def plan_in_time(
@@ -190,7 +192,8 @@ def choose_settings(
             if steps == _LEAST_STEPS:  # the time may be too short: the fastest is the best
                 loss = 100.0 + expected
             if loss < least_loss:
-                best, least_loss = TrainingSettings(size, count, steps, expected), loss
+                scaled_from = None if size is None or size == unscaled else unscaled
+                best, least_loss = TrainingSettings(size, count, steps, expected, scaled_from), loss
     assert best is not None
     return best
 

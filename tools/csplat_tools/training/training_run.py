@@ -32,6 +32,7 @@ from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
 _KEEP = 0.8  # default fraction of the trained splats that a file keeps: some of them are hardly seen
+_MOST_TRAINED = 3.0  # largest number of splats that a timed training for a size chooses, by those that the file keeps
 _BRIEF_TUNING = 1 / 4  # the same of trainings so short that it is fewer than the usual steps of a tuning
 _ANNOUNCED_FROM = 100  # steps; a few are timed before longer trainings
 _MUCH_SMALLER = 0.9  # fraction of its largest size below which a file is explained
@@ -47,6 +48,7 @@ def run_training(
     overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
+    expected: float | None = None,
     context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -60,6 +62,7 @@ def run_training(
         overrides: overrides of the data set's metadata.
         plot: a PNG to write with the loss over the steps.
         page: an HTML report to write.
+        expected: expected time of the whole run, seconds, if it has been announced; otherwise `None`.
         context: threads and progress.
         quiet: print nothing.
 
@@ -71,7 +74,7 @@ def run_training(
         OSError: a file cannot be read or written.
     """
     data_set = _load(data, options, files)
-    result = _train(data_set, options, files, plot=plot, context=context, quiet=quiet)
+    result = _train(data_set, options, files, plot=plot, expected=expected, context=context, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
@@ -96,13 +99,14 @@ def run_training_to_file(
     overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
+    expected: float | None = None,
     context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Read a data set, train, and tune a file to the same images; the trained scene itself is not written.
 
     Args:
-        data, overrides, plot, page, quiet: as for `run_training`.
+        data, overrides, plot, page, expected, quiet: as for `run_training`.
         options: options of the training; `plan_training` derives them from the target.
         output: the `.csplat` file to write, or `-`.
         files: as for `run_training`. Checkpoints of the tuning are next to the training's
@@ -123,7 +127,7 @@ def run_training_to_file(
     data_set = _load(data, options, files)
     for image in data_set.val:  # training does not read these images: this finds damaged files before it
         _ = image.pixels, image.mask
-    result = _train(data_set, options, files, plot=plot, context=context, quiet=quiet)
+    result = _train(data_set, options, files, plot=plot, expected=expected, context=context, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
     known = None
@@ -132,14 +136,21 @@ def run_training_to_file(
     report = run_finetuning(
         model, views, output, encoding, tuning, tuning_files,
         target=None if target is None or target.keep is not None else target, known=known, page=page,
-        training=result.log, context=context, quiet=quiet,
+        training=result.log, announced=expected is not None, context=context, quiet=quiet,
     )  # fmt: skip
     return {"training": result.log, "file": report}
 
 
-def splats_for(target: Target | None) -> int | None:
-    """Return the number of splats to train for a size, a quarter more than are kept; `None` without a size."""
-    return None if target is None or target.size_bytes is None else round(_kept_for(target.size_bytes) / _KEEP)
+def splats_for(target: Target | None, *, most: bool = False) -> int | None:
+    """Return the number of splats to train for a size, a quarter more than are kept; `None` without a size.
+
+    Args:
+        target: the target of the file.
+        most: return the largest number that is of use, for a training that has the time for it.
+    """
+    if target is None or target.size_bytes is None:
+        return None
+    return round(_kept_for(target.size_bytes) * (_MOST_TRAINED if most else 1.0 / _KEEP))
 
 
 def _kept_for(size_bytes: int) -> int:
@@ -259,7 +270,14 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
 
 
 def _train(
-    data_set: DataSet, options: TrainOptions, files: Outputs, *, plot: str | None, context: Context, quiet: bool
+    data_set: DataSet,
+    options: TrainOptions,
+    files: Outputs,
+    *,
+    plot: str | None,
+    expected: float | None,
+    context: Context,
+    quiet: bool,
 ) -> TrainResult:
     """Read the images, train, plot the loss to the path `plot` if given, and print a summary unless `quiet`.
 
@@ -272,11 +290,12 @@ def _train(
     data_set.read()  # to find damaged images before the first step
     context.progress("reading images", 1.0)
     done = 0 if files.resume is None else load_checkpoint(files.resume).iteration
-    is_long = not quiet and options.iterations - done >= _ANNOUNCED_FROM
-    expected = expected_seconds(data_set, options, done, context) if is_long else None
+    announced = expected is not None
+    if not announced and not quiet and options.iterations - done >= _ANNOUNCED_FROM:
+        expected = expected_seconds(data_set, options, done, context)
     with (
         thread_count(context.threads),
-        step_progress("training", describe_step, expected=expected, quiet=quiet) as show,
+        step_progress("training", describe_step, expected=expected, announced=announced, quiet=quiet) as show,
     ):
         result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:

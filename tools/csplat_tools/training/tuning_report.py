@@ -172,12 +172,11 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
 
 
 def describe_step(now: FitStep) -> str:
-    """Return the progress of a training or a tuning as a line."""
+    """Return the progress of a training or a tuning as a line, which a terminal of 80 columns may cut at its end."""
     size = "" if now.size_bytes is None else f", {format_bytes(now.size_bytes)}"
     return (
-        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
-        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}{size}, {format_seconds(now.seconds)},"
-        f" {format_seconds(now.seconds_left)} left"
+        f"{format_seconds(now.seconds_left)} left, {now.iteration}/{now.iterations} steps, PSNR {now.psnr:.2f} dB,"
+        f" {counted(now.splat_count, 'splat')}{size}"
     )
 
 

@@ -127,6 +127,7 @@ def run_finetuning(
     known: Mapping[str, Mapping[str, float | None]] | None = None,
     page: str | None = None,
     training: Mapping[str, Any] | None = None,
+    announced: bool = False,
     context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -145,6 +146,7 @@ def run_finetuning(
         known: as for `score_models`.
         page: an HTML report to write.
         training: log of the preceding training, for the report.
+        announced: as for `step_progress`.
         context: threads and progress; seed of the encoder and of pruning.
         quiet: print only errors.
 
@@ -156,7 +158,7 @@ def run_finetuning(
         OSError: a file cannot be read or written.
     """
     with thread_count(context.threads):
-        with step_progress("tuning", describe_step, quiet=quiet) as show:
+        with step_progress("tuning", describe_step, announced=announced, quiet=quiet) as show:
             tuned = choose_and_finetune(
                 source, views, encoding, options, target, files=files, prune_unseen=prune_unseen, importance=importance,
                 context=context, on_step=show,

@@ -118,8 +118,8 @@ def read_colmap(
     registered = _drop_repeated(registered, images_path, report)
     names = [image.name for image in registered]
     image_files = find_images(place, names, images_path.name, _image_folders(place, model, images), size)
-    shown = "the folder itself" if image_files.folder == folder else _relative_name(image_files.folder, folder)
-    report.append(f"images from {shown}")
+    shown = "that of the set" if image_files.folder == folder else _relative_name(image_files.folder, folder)
+    report.append(f"image folder: {shown}")
     report += image_files.notes
     report += describe_missing([name for name in names if name not in image_files.files], len(names), images_path.name)
     masks = _find_image_masks(place, image_files.files, report)

@@ -174,7 +174,7 @@ def _read_shots(
             raise
         image_files = FoundImages(folder, {})
     if image_files.folder != folder:
-        report.append(f"images from {image_files.folder.relative_to(folder).as_posix()}")
+        report.append(f"image folder: {image_files.folder.relative_to(folder).as_posix()}")
     report += image_files.notes
     report += describe_missing([name for name in names if name not in image_files.files], len(names), path.name)
     masks = _find_frame_masks(place, frames, path, report)

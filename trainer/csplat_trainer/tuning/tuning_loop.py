@@ -141,7 +141,10 @@ class _Tuning:
         checkpoint = load_checkpoint(path, "finetune")
         own, arrays = checkpoint.own, checkpoint.arrays
         if own.get("fixed") != fingerprint(fixed):
-            raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+            raise InputError(
+                f"{path} belongs to another scene, or to other options of the encoder: remove it, or repeat the"
+                " options of its run"
+            )
         if checkpoint.log.get("views") != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
         controller = RateController.of(own.get("controller"))
