@@ -41,6 +41,16 @@ test('controls have limits, and a background may be transparent', () => {
   assert.equal(readWishes(new URLSearchParams('controls=none')).wishes.limits.kind, 'none');
 });
 
+test('a word that controls do not have is named, next to all limits', () => {
+  const unknown = { fly: 'fly', 'orbit  max-azimut=9 min-polar=1': 'max-azimut=9', 'none orbit': 'none', 'max-polar=-1': 'max-polar=-1' }; // prettier-ignore
+  for (const [controls, word] of Object.entries(unknown)) {
+    const [complaint] = readWishes(new URLSearchParams({ controls })).complaints;
+    assert.ok(complaint.startsWith(`controls has the word “${word}”, expected `), complaint);
+    for (const name of ['distance', 'polar', 'azimuth'])
+      assert.match(complaint, new RegExp(`min-${name}.* max-${name}`));
+  }
+});
+
 test('every parameter is read', () => {
   const { wishes, complaints } = readWishes(
     new URLSearchParams(
