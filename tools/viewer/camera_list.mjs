@@ -20,7 +20,6 @@ import { dot, sub, unitDirection } from './vectors.mjs';
  * @typedef {FileCamera & {image: string}} Camera
  */
 
-const WHOLE = 3 / 4; // width / height of the part of a photograph that every canvas shows: more would add what no camera saw
 const SAME = 0.999; // cosine of the angle within which directions count as equal
 
 /** @returns {Pose} placeholder until a scene is loaded */
@@ -248,7 +247,6 @@ export class CameraList {
     const wanted = this.wantedCameras[this.first];
     if (wanted) return this.#poseOf(wanted);
     const first = /** @type {import('../../codec/js/first_view.mjs').FirstView} */ (this.firstCamera);
-    if (this.facts.start && first.from === 'training') return this.#poseOf(middleOf(first)); // of surroundings
     return first.isFound ? this.#poseOf(first) : this.rig.limited(this.#poseOf(first, null));
   }
 
@@ -268,15 +266,6 @@ export class CameraList {
     const depth = seen ? dot(sub(seen, eye), basis[2]) : 0;
     return { basis, eye, distance: depth > 0.05 * ball.radius ? depth : distance, up, lens, near, viewmat: m };
   }
-}
-
-/**
- * @param {FileCamera} camera
- * @returns {FileCamera} with the lens of the middle of its picture, if that is wide
- */
-function middleOf({ lens, ...others }) {
-  const W = Math.min(lens.W, WHOLE * lens.H);
-  return { ...others, lens: { ...lens, W, cx: lens.cx - (lens.W - W) / 2 } };
 }
 
 /**

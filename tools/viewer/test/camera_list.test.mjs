@@ -98,19 +98,3 @@ test('azimuths count from the view that a scene is loaded with, or that a turn o
   view.turnUpright();
   assert.equal(rig.front, rig.home);
 });
-
-test('a narrow canvas shows the middle of a photograph of surroundings, and the whole of any other first view', () => {
-  for (const [described, narrow] of [
-    [{ metadata: { view: { ...LEVEL, from: 'training' } } }, 60],
-    [{ metadata: { view: { ...LEVEL, from: 'author' } } }, 33.75],
-    [{ cameras: [LEVEL] }, 33.75],
-  ]) {
-    const rig = new OrbitCamera(emptyPose(), 1);
-    const view = new CameraList(rig, { touched: false, glide: (pose) => (rig.pose = pose) }, { up: null, axes: null });
-    view.read({ axes: '', tiles: [] }, { metadata: null, cameras: null, ...described });
-    view.place({ samples: new Float32Array(0), weights: new Float32Array(0) });
-    const [tall, wide] = [rig.camera(30, 60), rig.camera(160, 60)];
-    assert.deepEqual([tall.fx, tall.fy, tall.cx, tall.cy], [narrow, narrow, 15, 30]);
-    assert.deepEqual([wide.fx, wide.fy, wide.cx, wide.cy], [90, 90, 80, 30]);
-  }
-});
