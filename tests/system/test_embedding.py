@@ -667,3 +667,14 @@ def test_controls_can_be_limited_and_turned_off(tab, blog):
     page.wait_for_timeout(100)
     forward = page.evaluate("view.camera.viewmat[2]")
     assert forward[1] >= -1e-6  # y is down: the camera is not below the pivot
+
+    # The limits of the azimuth stay with the view at loading, not with a camera of the program.
+    page.evaluate("globalThis.first = view.camera; view.controls = 'orbit min-azimuth=-20 max-azimuth=10'")
+    for key, angle in (("ArrowRight", -20), ("ArrowLeft", 10)):
+        page.evaluate("view.camera = view.camera")
+        page.keyboard.down(key)
+        page.wait_for_timeout(1500)
+        page.keyboard.up(key)
+        page.wait_for_timeout(100)
+        (x, _, z, _), (ahead_x, _, ahead_z, _) = page.evaluate("[view.camera, first].map(({ viewmat }) => viewmat[2])")
+        assert abs(np.degrees(np.arctan2(ahead_x * z - ahead_z * x, x * ahead_x + z * ahead_z)) - angle) < 0.01

@@ -349,8 +349,9 @@ def test_the_current_camera_can_be_kept_as_the_first_view(viewer, make_model, tm
     page.keyboard.press("v")
     assert "csplat encode scene.ply scene.csplat --cameras view.json" == viewer.text("#keep-command")
     name, text = downloaded(page, "#keep-camera")
-    _, kept = downloaded(page, "#keep-download")
-    assert "view.json" == name
+    assert viewer.text("#keep p:has(#keep-download)").startswith("Download scene.csplat with it: all else stays.")
+    file_name, kept = downloaded(page, "#keep-download")
+    assert ["view.json", "scene.csplat"] == [name, file_name]
     view = decode(kept).metadata.entries["view"]
     assert [{key: value for key, value in view.items() if key != "from"}] == json.loads(text)
     assert "author" == view["from"]

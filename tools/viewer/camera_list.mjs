@@ -177,6 +177,7 @@ export class CameraList {
     if (isPlaced && this.controls.touched) return false;
     this.rig.extent = this.ball.radius;
     this.rig.home = this.#firstPose();
+    if (!isPlaced) this.rig.front = this.rig.home;
     if (this.controls.touched) return false;
     if (isPlaced) this.rig.pose = this.rig.home;
     else this.controls.glide(this.rig.home, true);
@@ -221,7 +222,7 @@ export class CameraList {
   turnUpright() {
     const all = waysUp(this.#firstUp());
     this.up = all[(all.findIndex((up) => dot(up, this.up) > SAME) + 1) % all.length];
-    this.rig.home = this.rig.limited(this.rig.turnedUp(this.up));
+    this.rig.front = this.rig.home = this.rig.limited(this.rig.turnedUp(this.up));
     this.controls.touched = true;
     this.controls.glide(this.rig.home);
     return { up: this.up, isSaid: this.saidUp !== null && dot(this.saidUp, this.up) > SAME };

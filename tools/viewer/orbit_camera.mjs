@@ -37,8 +37,8 @@ import {
  * @typedef {{viewmat: number[], fx: number, fy: number, cx: number, cy: number, near: number}} EngineCamera
  *
  * What users may do: everything, orbit a pivot that stays, or nothing; distance to the pivot, scene units; angle at the pivot
- * between up and the camera, radians.
- * @typedef {{kind: 'free' | 'orbit' | 'none', distance: [number, number], polar: [number, number]}} Limits
+ * between up and the camera, radians; angle around up from the first view, above 0 to the right of it, radians.
+ * @typedef {Record<'distance' | 'polar' | 'azimuth', [number, number]> & {kind: 'free' | 'orbit' | 'none'}} Limits
  */
 
 const POLE = 0.02; // minimum angle between the line of sight and the vertical, radians
@@ -50,7 +50,7 @@ const NEAR_SHARE = 0.1; // maximum distance of the near plane, as a share of the
 export const FIELD_OF_VIEW = (55 * Math.PI) / 180;
 
 /** @type {Limits} */
-const NO_LIMITS = { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI] };
+const NO_LIMITS = { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI], azimuth: [-Math.PI, Math.PI] };
 
 /** @returns {Lens} the default lens */
 export function defaultLens() {
@@ -77,6 +77,7 @@ export class OrbitCamera {
     this.limits = limits;
     this.pose = pose;
     this.home = pose;
+    this.front = pose; // its azimuth is 0
     this.extent = extent;
   }
 
@@ -230,13 +231,30 @@ export class OrbitCamera {
    * @returns {Basis}
    */
   #turned(right, down) {
-    const { basis, up } = this.pose;
-    const turned = turnBasis(basis, up, -right);
-    const slope = Math.acos(Math.min(1, Math.max(-1, dot(turned[2], up)))); // 0: straight up
+    const { up } = this.pose;
+    const [least, most] = this.limits.azimuth;
+    const basis = this.#pitched(this.pose.basis, down);
+    if (most - least >= 2 * Math.PI) return turnBasis(basis, up, -right);
+    const aside = cross(up, this.#pitched(this.front.basis, 0)[2]);
+    const azimuth = Math.atan2(dot(basis[2], aside), dot(basis[2], cross(aside, up)));
+    const turns = Math.round((azimuth - (least + most) / 2) / (2 * Math.PI)); // away from the middle of the limits
+    const from = azimuth - 2 * Math.PI * turns;
+    return turnBasis(basis, up, Math.min(Math.max(from - right, least), most) - from);
+  }
+
+  /**
+   * Pitch a basis within the limits, off the vertical.
+   *
+   * @param {Basis} basis
+   * @param {number} down
+   * @returns {Basis}
+   */
+  #pitched(basis, down) {
+    const slope = Math.acos(Math.min(1, Math.max(-1, dot(basis[2], this.pose.up)))); // 0: straight up
     const [least, most] = this.limits.polar.map((angle) => Math.PI - angle).reverse();
     const wanted = Math.min(Math.max(slope + down, POLE, least), Math.PI - POLE, most);
     // An initial view that is rolled has a tilted horizon, and pitches around the horizontal axis of its picture.
-    return turnBasis(turned, turned[0], slope - wanted);
+    return turnBasis(basis, basis[0], slope - wanted);
   }
 
   /** @param {Partial<Pose>} change */

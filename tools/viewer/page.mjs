@@ -26,8 +26,9 @@ import { unitDirection } from './vectors.mjs';
 
 const UP = /^[-+.\de]+(?:,[-+.\de]+){2}$/i;
 const AXES = /^(?=.*[RL])(?=.*[UD])(?=.*[FB])[RLUDFB]{3}$/;
-const LIMIT = '(?:orbit|(?:min|max)-(?:distance|polar)=(?:\\d+\\.?|\\d*\\.\\d+))';
-const CONTROLS = new RegExp(`^\\s*(?:none|${LIMIT}(?:\\s+${LIMIT})*)\\s*$`);
+const CONTROL = /^(?:orbit|(?:min|max)-(?:distance=|polar=|azimuth=-?)(?:\d+\.?|\d*\.\d+))$/;
+const CONTROLS =
+  'none alone, or orbit and limits as max-polar=90: min-distance, max-distance, min-polar, max-polar, min-azimuth, max-azimuth';
 const THREE = 'three numbers as 0,-1,0';
 
 /** @returns {Embedded | null} */
@@ -66,10 +67,13 @@ export function readWishes(query) {
   };
   const axes = match('axes', AXES, 'three letters as RDF');
   const backend = match('backend', /^(auto|webgl2|webgpu(-tiles|-quads)?)$/, 'auto, webgl2 or webgpu');
-  const controls = match('controls', CONTROLS, 'none, or limits as orbit min-distance=1 max-polar=90');
-  let limits = limitsOf(controls?.[0] ?? '');
-  if ([limits.distance, limits.polar].some(([least, most]) => least > most)) {
-    complaints.push(`controls is “${query.get('controls')}”, expected minima below the maxima`);
+  const controls = query.get('controls')?.trim() ?? '';
+  const unknown = controls !== 'none' && controls.split(/\s+/).find((word) => word && !CONTROL.test(word));
+  if (unknown) complaints.push(`controls has the word “${unknown}”, expected ${CONTROLS}`);
+  let limits = limitsOf(unknown ? '' : controls);
+  const { distance, polar, azimuth } = limits;
+  if ([distance, polar, azimuth].some(([least, most]) => least > most) || azimuth[0] > 0 || azimuth[1] < 0) {
+    complaints.push(`controls is “${controls}”, expected minima below the maxima, azimuths around 0`);
     limits = limitsOf('');
   }
   const view = match('view', /^\d{1,6}$/, 'a number from 0');
@@ -106,6 +110,7 @@ function limitsOf(text) {
     kind,
     distance: [value('min-distance', 0), value('max-distance', Infinity)],
     polar: [radians(value('min-polar', 0)), radians(value('max-polar', 180))],
+    azimuth: [radians(value('min-azimuth', -180)), radians(value('max-azimuth', 180))],
   };
 }
 

@@ -88,11 +88,12 @@ export class SaveOffer {
    * @param {MetadataChanges} changes
    */
   show(name, { up, view }) {
-    this.name = name;
+    this.name = name || 'scene.csplat';
     this.changes = { ...(up && { up: rounded(up) }), ...(view && { view: roundedCamera(view) }) };
     const isUp = up ? `${upWord(up).replace('-', '−')} is up.` : '';
     element('keep-title', HTMLElement).textContent = view ? `The first view is this one. ${isUp}`.trim() : isUp;
-    element('keep-command', HTMLElement).textContent = saveCommand(name, this.changes);
+    element('keep-name', HTMLElement).textContent = this.name;
+    element('keep-command', HTMLElement).textContent = saveCommand(this.name, this.changes);
     element('keep-camera', HTMLElement).hidden = !view;
     element('keep', HTMLElement).hidden = false;
   }
@@ -122,7 +123,7 @@ export class SaveOffer {
     const { name, changes } = this;
     button.disabled = true;
     try {
-      saveFile(await this.hooks.file(changes), name || 'scene.csplat', 'model/vnd.csplat');
+      saveFile(await this.hooks.file(changes), name, 'model/vnd.csplat');
     } catch (error) {
       this.hooks.say(`The file could not be written: ${error instanceof Error ? error.message : error}`);
     } finally {

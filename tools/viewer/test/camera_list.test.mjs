@@ -82,3 +82,19 @@ test('the first view is placed when the header is here, and stays when the splat
   assert.equal(moves.length, 2);
   assert.equal(rig.pose.distance, 4.5); // the pivot lies on the surface
 });
+
+test('azimuths count from the view that a scene is loaded with, or that a turn of the scene gives', () => {
+  const rig = new OrbitCamera(emptyPose(), 1);
+  const controls = { touched: false, glide: (pose) => (rig.pose = pose) };
+  const view = new CameraList(rig, controls, { up: null, axes: null });
+  view.read({ axes: '', tiles: [] }, { metadata: { view: LEVEL }, cameras: null });
+  view.place({ samples: new Float32Array(0), weights: new Float32Array(0) });
+  const front = rig.home;
+  assert.equal(rig.front, front);
+  view.useCameras([{ ...LEVEL, viewmat: [[-1, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 1]] }], 0); // prettier-ignore
+  view.showFirst();
+  assert.equal(rig.front, front);
+  assert.notEqual(rig.home, front);
+  view.turnUpright();
+  assert.equal(rig.front, rig.home);
+});

@@ -200,7 +200,7 @@ test('the shorter rotation is taken', () => {
 
 test('limits hold for the distance to the pivot and for the angle from above', () => {
   const some = rig();
-  some.limits = { kind: 'orbit', distance: [2, 5], polar: [Math.PI / 3, Math.PI / 2] };
+  some.limits = { kind: 'orbit', distance: [2, 5], polar: [Math.PI / 3, Math.PI / 2], azimuth: [-Math.PI, Math.PI] };
   const polar = () => Math.acos(-dot(some.pose.basis[2], some.pose.up));
   for (const [down, angle] of [
     [9, Math.PI / 3],
@@ -220,4 +220,77 @@ test('limits hold for the distance to the pivot and for the angle from above', (
   const { pose } = rig();
   close([some.limited({ ...pose, distance: 9, eye: [0, 0, -9] }).distance], [5]);
   assert.deepEqual(pivotOf(some.limited(pose)), [0, 0, 0]);
+});
+
+/** The angle around the up direction from the first view to the current one, above 0 to the right, in degrees. */
+function azimuth({ pose, front: { eye } }) {
+  const [x, y] = [dot(pose.eye, cross(pose.up, eye)), dot(pose.eye, eye) - dot(pose.eye, pose.up) * dot(eye, pose.up)];
+  return (180 / Math.PI) * Math.atan2(x, y);
+}
+
+/** A rig whose first view looks at the origin along a direction, and the limits of its azimuth, in degrees. */
+function facing(direction, up, [least, most]) {
+  const basis = lookAlong(direction, up);
+  const some = rig({ basis, up, eye: basis[2].map((value) => -3 * value) });
+  some.limits = { ...some.limits, azimuth: [(least * Math.PI) / 180, (most * Math.PI) / 180] };
+  return some;
+}
+
+for (const [direction, up] of [
+  [
+    [0, 0, 1],
+    [0, -1, 0],
+  ],
+  [
+    [0.6, 0.7, -0.3],
+    [0, 0, 1],
+  ],
+  [
+    [1, 2, 3],
+    [0.48, 0.6, 0.64],
+  ],
+]) {
+  test(`limits hold for the angle around ${up} from the first view`, () => {
+    const some = facing(direction, up, [-40, 25]);
+    const drags = [[-0.2, 11.4592], [-0.2, 22.9183], [-0.2, 25], [-9, 25], [0.1, 19.2704], [99, -40], [0, -40]]; // prettier-ignore
+    for (const [right, angle] of drags) {
+      some.orbit(right, 0.1);
+      close([azimuth(some)], [angle], 1e-4);
+    }
+    some.zoom(0.5, { x: 0, y: 0, width: WIDTH, height: HEIGHT });
+    some.orbit(0, 0);
+    some.pose = some.front;
+    some.orbit(0, 0);
+    close(some.pose.eye, some.front.eye);
+  });
+}
+
+test('one limit of the azimuth leaves the other side free to the back', () => {
+  const some = facing([0, 0, 1], [0, -1, 0], [-180, 90]);
+  some.orbit(6, 0);
+  close([Math.abs(azimuth(some))], [180]);
+  some.orbit(-0.1, 0);
+  close([azimuth(some)], [-180 + 18 / Math.PI]);
+});
+
+test('a camera beyond the limits of the azimuth comes to the nearer one when it moves', () => {
+  const some = facing([0, 0, 1], [0, -1, 0], [-120, 30]);
+  for (const [direction, angle] of [[[-1, 0, 0.5], 30], [[-0.1, 0, -1], -120], [[-1, 0, -0.8], 30]]) {
+    some.pose = facing(direction, [0, -1, 0], [0, 0]).pose;
+    some.orbit(0, 0);
+    close([azimuth(some)], [angle]);
+  } // prettier-ignore
+});
+
+test('limits of the azimuth hold if the first view is rolled, or looks straight down', () => {
+  const rolled = facing([0.2, 0.1, 1], [0, -1, 0], [-30, 30]);
+  rolled.front = rolled.pose = { ...rolled.pose, basis: turnBasis(rolled.pose.basis, rolled.pose.basis[2], 1.2) };
+  for (const [right, down] of [[0.3, 0.2], [2, -1], [-5, 0.7], [0, 0.9]]) {
+    rolled.orbit(right, down);
+    assert.ok(Math.abs(azimuth(rolled)) < 30 + 1e-6, `${azimuth(rolled)}`);
+  } // prettier-ignore
+  const above = facing([0, 1, 0], [0, -1, 0], [-30, 30]);
+  const [before] = above.pose.basis;
+  for (const down of [-0.5, 0.2]) above.orbit(9, down);
+  close([dot(above.pose.basis[0], before)], [Math.cos(Math.PI / 6)]);
 });

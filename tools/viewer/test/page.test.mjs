@@ -21,7 +21,7 @@ test('an empty address has no parameters', () => {
     axes: null,
     size: null,
     background: null,
-    limits: { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI] },
+    limits: { kind: 'free', distance: [0, Infinity], polar: [0, Math.PI], azimuth: [-Math.PI, Math.PI] },
     ui: true,
     backend: 'auto',
   });
@@ -29,13 +29,26 @@ test('an empty address has no parameters', () => {
 
 test('controls have limits, and a background may be transparent', () => {
   const { wishes, complaints } = readWishes(
-    new URLSearchParams('background=Transparent&controls=orbit max-distance=2.5 min-polar=45%20 max-polar=90'),
+    new URLSearchParams(
+      'background=Transparent&controls=orbit max-distance=2.5 min-polar=45%20 max-polar=90 min-azimuth=-45',
+    ),
   );
   assert.deepEqual(complaints, []);
   const { background, limits } = wishes;
   assert.equal(background, 'transparent');
-  assert.deepEqual(limits, { kind: 'orbit', distance: [0, 2.5], polar: [Math.PI / 4, Math.PI / 2] });
+  const [distance, polar, azimuth] = [[0, 2.5], [Math.PI / 4, Math.PI / 2], [-Math.PI / 4, Math.PI]]; // prettier-ignore
+  assert.deepEqual(limits, { kind: 'orbit', distance, polar, azimuth });
   assert.equal(readWishes(new URLSearchParams('controls=none')).wishes.limits.kind, 'none');
+});
+
+test('a word that controls do not have is named, next to all limits', () => {
+  const unknown = { fly: 'fly', 'orbit  max-azimut=9 min-polar=1': 'max-azimut=9', 'none orbit': 'none', 'max-polar=-1': 'max-polar=-1' }; // prettier-ignore
+  for (const [controls, word] of Object.entries(unknown)) {
+    const [complaint] = readWishes(new URLSearchParams({ controls })).complaints;
+    assert.ok(complaint.startsWith(`controls has the word “${word}”, expected `), complaint);
+    for (const name of ['distance', 'polar', 'azimuth'])
+      assert.match(complaint, new RegExp(`min-${name}.* max-${name}`));
+  }
 });
 
 test('every parameter is read', () => {
@@ -68,6 +81,8 @@ const LIMITS = [
   'controls=none orbit',
   'controls=max-polar',
   'controls=min-distance=-1',
+  'controls=min-azimuth=10',
+  'controls=min-azimuth=-20 max-azimuth=-10',
 ];
 const NOWHERE = ['up=z', 'up=0,1', 'up=0,0,0', 'up=1,2,3,4', 'up=1,e,2', 'up=1e999,0,0'];
 for (const query of [...WRONG, ...LIMITS, ...NOWHERE]) {
