@@ -15,7 +15,7 @@ from csplat.sizes import Size, parse_size
 from csplat.types import PSNR_CAP
 
 _DROPS = (0.001, 60.0)  # allowed range of `max_psnr_drop`, dB
-_EFFORTS = (1, 9)  # allowed range of `effort`
+_EFFORTS = (1, 5)  # allowed range of `effort`; 7 made larger files than 5 on all of four scenes
 
 
 class Views(Protocol):
@@ -50,7 +50,7 @@ class Target:
             versions 1 and 2, and alpha of SOG; `covariance` and `sh0` then differ by roundings to float32.
         prune: prune splats, and refit the others, if that makes a smaller or better file. Without, a search takes less
             than half of the time.
-        effort: 1 to 9, work of the search: number of views, candidates and refit steps.
+        effort: 1 to 5, work of the search: number of candidates and refit steps.
 
     Raises:
         InputError: no target is given, or several, or a value is out of range.

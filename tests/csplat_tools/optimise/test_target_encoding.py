@@ -500,7 +500,7 @@ def test_the_command_refuses_options_without_effect(tmp_path, ply):
         ("--target-size many", "a size is"), ("--target-psnr 120", "at most 99"),
         ("--target-size 10 --no-prune", "no file"), ("--max-error means=1mm", "--unit-metres"),
         ("--keep 0.5 --max-error means=1", "no bounds"),
-        ("--effort 12 --target-size 5kB", "the effort is 12, expected 1 to 9"),
+        ("--effort 12 --target-size 5kB", "the effort is 12, expected 1 to 5"),
         ("--effort 2", "--effort requires --target-psnr or"), ("--no-prune", "--no-prune requires --target-psnr or"),
         ("--max-error means=1 --data d", "--data requires --target-psnr or"),
         ("--max-psnr-drop 1 --cameras c.json", "--max-psnr-drop requires --data"),

@@ -121,7 +121,7 @@ SmallPreset = Annotated[
 TargetPsnr = Annotated[str | None, typer.Option(metavar="DB", help="Least PSNR, e.g. 40dB. Default: none.")]
 TargetSize = Annotated[str | None, typer.Option(metavar="BYTES", help="Largest file, e.g. 5MB. Default: none.")]
 MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest loss on images, e.g. 0.3dB.")]
-_effort = typer.Option("--effort", metavar="1..9", help="Work for fewer bytes. Default: 3.")
+_effort = typer.Option("--effort", metavar="1..5", help="Work for fewer bytes. Default: 3.")
 Effort = Annotated[int | None, _effort]
 HiddenEffort = Annotated[int | None, hidden(_effort)]
 _keep = typer.Option("--keep", metavar="FRACTION", help="Fraction of splats to keep, e.g. 0.5.")

@@ -40,7 +40,7 @@ class SimplifyOptions:
 
     Attributes:
         refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
-        effort: amount of work, 1 to 9. Steps of refits halve with each level below 3, and double with every two above.
+        effort: amount of work, 1 to 5. Steps of refits halve with each level below 3, and double with every two above.
         view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
         views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
         background: red, green, blue behind virtual views; given views have their own.
@@ -56,8 +56,8 @@ class SimplifyOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.effort <= 9:
-            raise InputError(f"effort is {self.effort}, expected 1 to 9")
+        if not 1 <= self.effort <= 5:
+            raise InputError(f"effort is {self.effort}, expected 1 to 5")
         if self.views is not None and self.views < 1:
             raise InputError(f"views is {self.views}, expected at least 1")
         if self.view_size is not None and min(self.view_size) < 1:

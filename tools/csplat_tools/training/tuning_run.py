@@ -223,7 +223,7 @@ class Tuner:
         encoding, options: options of the encoder and of the tuning.
         outputs: checkpoints; the first file resumes from them.
         prune_unseen: splats that no training or validation view shows are pruned.
-        effort: amount of work of pruning and refitting, 1 to 9.
+        effort: amount of work of pruning and refitting, 1 to 5.
         importance: importance of the source's splats; `None`: the importance of each file's splats is measured in the
             training views, as `csplat sensitivity` does.
         context, on_step: as for `csplat_trainer.finetune`.
