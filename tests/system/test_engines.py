@@ -148,6 +148,16 @@ def test_the_picture_equals_the_picture_of_the_ply(trial, picture):
     assert psnr(picture[0], shown(trial, "scene.ply")[0]) > LIKE_THE_PLY[trial.engine]
 
 
+def test_a_splat_far_away_does_not_spoil_the_order_in_three_js(trial, picture, files):
+    if trial.engine != "three":
+        pytest.skip("the order of the other engines does not depend on the loader")
+    folder, _, model, _ = files
+    far = model.select(np.arange(len(model) + 1) % len(model))
+    far.means[-1] = [0.0, 0.0, 3e3]
+    (folder / "far.csplat").write_bytes(encode(far, replace(FAST, tile_splats=256)))
+    assert psnr(picture[0], shown(trial, "far.csplat")[0]) > 42.0
+
+
 @pytest.mark.parametrize(
     ("file", "code"), [("flipped", "E_CRC"), ("cut", "E_TRUNCATED"), ("text", "E_MAGIC"), ("none", "E_INPUT")]
 )

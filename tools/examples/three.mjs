@@ -14,8 +14,9 @@ try {
   const url = new URLSearchParams(location.search).get('scene') ?? 'scene.csplat';
   const geometry = await new CSPLATLoader().loadAsync(url, ({ loaded }) => (words.textContent = `${loaded} bytes`));
   const splats = new GaussianSplat(geometry);
-  const { upright, view } = geometry.userData.csplat;
+  const { refine, upright, view } = geometry.userData.csplat;
   splats.applyMatrix4(upright);
+  refine(splats);
   scene.add(splats);
   camera.up.fromArray(view.up);
   camera.position.fromArray(view.position);

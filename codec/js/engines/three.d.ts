@@ -17,7 +17,8 @@ export type SplatGeometry = BufferGeometry & {
       /** Makes the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. The identity, unless the file
        * has an up direction or axes that signs alone do not change to these. */
       upright: Matrix4;
-      /** With the option `levels`: from now on, draw in this object what the camera of each frame requires. */
+      /** Bounds the object without splats far away, since it sorts in 4,096 steps of its bounding sphere. With the option
+       * `levels`: from now on, it draws what the camera of each frame requires. */
       refine(splats: GaussianSplat): void;
     };
   };

@@ -4,7 +4,7 @@
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');
 //   const splats = new GaussianSplat(geometry); // from three/addons/objects/GaussianSplat.js
 //   splats.applyMatrix4(geometry.userData.csplat.upright);
-//   geometry.userData.csplat.refine(splats); // with the option `levels`
+//   geometry.userData.csplat.refine(splats);
 
 import { Box3, BufferAttribute, BufferGeometry, Loader, Matrix4, Sphere, Vector2, Vector3 } from 'three';
 
@@ -26,6 +26,7 @@ const NAME = 'CSPLATLoader';
 const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true, aligns: true, shDegree: 3 };
 const SH_WORDS = [0, 3, 4, 6]; // words per splat in a band, of four coefficients each
 const SH_ZERO = 0x80808080;
+const SORTED = 4; // radius of the sphere in whose 4,096 steps splats are sorted, by that of the ball around most of them
 
 /** Loads splats as a geometry for GaussianSplat. */
 export class CSPLATLoader extends Loader {
@@ -154,7 +155,13 @@ async function geometryOf(scene) {
   }
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
-  const refine = (/** @type {GaussianSplat} */ splats) => drawing?.start(splats);
+  const { center, radius } = facts.bounds;
+  const middle = new Vector3(...center).applyMatrix4(upright.clone().invert());
+  const sphere = new Sphere(middle, Math.min(SORTED * radius, 2 * (geometry.boundingSphere?.radius ?? Infinity)));
+  const refine = (/** @type {GaussianSplat} */ splats) => {
+    splats.boundingSphere = sphere;
+    drawing?.start(splats);
+  };
   const [x, y, z] = scene.signs;
   geometry.userData = { csplat: { ...facts, fromFile: new Matrix4().makeScale(x, y, z), upright, refine } };
   geometry.addEventListener('dispose', () => scene.abort());
@@ -189,7 +196,6 @@ class Drawing {
 
   /** @param {GaussianSplat} splats */
   start(splats) {
-    splats.boundingSphere = this.geometry.boundingSphere;
     const { onBeforeRender: own } = splats;
     splats.onBeforeRender = (renderer, scene, camera) => {
       this.modelView.multiplyMatrices(camera.matrixWorldInverse, splats.matrixWorld);

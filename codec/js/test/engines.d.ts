@@ -10,7 +10,10 @@ declare module 'three' {
     constructor(min: Vector3, max: Vector3);
     getBoundingSphere(target: Sphere): Sphere;
   }
-  export class Sphere {}
+  export class Sphere {
+    constructor(center?: Vector3, radius?: number);
+    radius: number;
+  }
   export class BufferGeometry {
     userData: object;
     attributes: Record<string, BufferAttribute>;
@@ -23,6 +26,8 @@ declare module 'three' {
   }
   export class Matrix4 {
     elements: number[];
+    clone(): Matrix4;
+    invert(): this;
     set(...rows: number[]): this;
     makeScale(x: number, y: number, z: number): this;
     multiplyMatrices(a: Matrix4, b: Matrix4): this;
@@ -33,6 +38,7 @@ declare module 'three' {
   }
   export class Vector3 {
     constructor(...coordinates: number[]);
+    applyMatrix4(matrix: Matrix4): this;
   }
   export class PerspectiveCamera {
     near: number;

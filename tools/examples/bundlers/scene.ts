@@ -17,9 +17,10 @@ export async function load(url: string, signal?: AbortSignal): Promise<SplatGeom
 /** Draw a scene until the signal aborts; resolve with the number of splats. */
 export async function show(canvas: HTMLCanvasElement, url: string, signal?: AbortSignal): Promise<number> {
   const geometry = await load(url, signal);
-  const { bounds, splatCount, upright } = geometry.userData.csplat;
+  const { bounds, refine, splatCount, upright } = geometry.userData.csplat;
   const splats = new GaussianSplat(geometry);
   splats.applyMatrix4(upright);
+  refine(splats);
   const [x, y, z] = bounds.center;
   const camera = new PerspectiveCamera(45, canvas.clientWidth / canvas.clientHeight, 0.01, 1000);
   camera.position.set(x, y + bounds.radius, z + 3 * bounds.radius);
