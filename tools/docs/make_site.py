@@ -56,6 +56,7 @@ _COMMENT = re.compile(r"^<!--.*?-->\n", re.MULTILINE)
 _WORDS = re.compile(r"^(`{3,}\w+) .+$", re.MULTILINE)
 _FENCE = re.compile(r"^\s*(`{3,}|~{3,})")
 _ITEM = re.compile(r"^(?:[-*]|\d+\.) ")
+_BLOCK = re.compile(r"(?ms)^ *(`{3,}).*?^ *\1$")
 _COLUMNS = "80"
 
 
@@ -209,8 +210,8 @@ def _is_cut(page: str) -> bool:
     """Return True if headings, tables or code blocks were lost: Python-Markdown parses less than GitHub."""
     text = (COLLECTED / page).read_text("utf-8")
     html = (SITE / page).with_suffix(".html").read_text("utf-8").partition("md-content__inner")[2]
-    blocks = len(re.findall(r"(?ms)^(`{3,}).*?^\1$", text))
-    prose = re.sub(r"(?ms)^(`{3,}).*?^\1$", "", text)
+    blocks = len(_BLOCK.findall(text))
+    prose = _BLOCK.sub("", text)
     headings, tables = (len(re.findall(one, prose, re.MULTILINE)) for one in (r"^#{1,6} ", r"^\|[ :|-]+\|$"))
     found = len(re.findall(r"<h[1-6] id=", html)), html.count("<table>"), html.count("<pre>")
     return found != (headings, tables, blocks)
