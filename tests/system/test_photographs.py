@@ -85,8 +85,10 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     table = call("compare", *files, "--data", data).stdout
     assert f"the worst image is {a['worst_image']} in A, {b['worst_image']} in B" in table
     assert min(a["psnr_worst"], b["psnr_worst"]) == b["psnr_worst"]
-    again = csplat.compare(*map(str, files), data=str(data))
+    again = csplat.compare(*map(str, files), data=data)
     assert (scores, result["psnr"]) == (again.images, again.psnr)
+    with pytest.raises(InputError, match="only one of them"):
+        csplat.compare(*map(str, files), data=data, views=Mock())
     training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
     assert 6 == training["images"]["a"]["views"]

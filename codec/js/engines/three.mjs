@@ -157,6 +157,7 @@ async function geometryOf(scene) {
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
   const { center, radius } = facts.bounds;
   const middle = new Vector3(...center).applyMatrix4(upright.clone().invert());
+  // From a middle inside of it, twice the radius of a sphere reaches all of the sphere.
   const sphere = new Sphere(middle, Math.min(SORTED * radius, 2 * (geometry.boundingSphere?.radius ?? Infinity)));
   const refine = (/** @type {GaussianSplat} */ splats) => {
     splats.boundingSphere = sphere;

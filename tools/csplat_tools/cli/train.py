@@ -24,7 +24,7 @@ _BACKGROUNDS = ", ".join(BACKGROUNDS)
 if TYPE_CHECKING:
     from csplat_tools.training.time_plan import TrainingSettings
 
-_FRACTIONS = {2: "half", 4: "a quarter of", 8: "an eighth of"}  # of the width of images, by how many times less it is
+_FRACTIONS = {2: "half", 4: "a quarter of", 8: "an eighth of"}  # names of 1 / divisor of the width, by divisor
 _HOUR = 3600.0  # seconds, the default of --time
 
 

@@ -167,7 +167,7 @@ def compare(
     b: SceneLike,
     *,
     cameras: str | os.PathLike[str] | None = None,
-    data: str | DataOptions | None = None,
+    data: str | os.PathLike[str] | DataOptions | None = None,
     views: ViewSet | None = None,
     source_index: NDArray[np.integer[Any]] | None = None,
     lpips: str | None = None,
@@ -186,8 +186,8 @@ def compare(
             format.
         cameras: a camera file with the views.
         data: a data set, whose test images are the views; A and B are scored against them, too.
-        views: the views, found already (`find_view_set`). Default without any of the three: the eight virtual views of
-            `psnr`, 640×480, on black.
+        views: the views, found already (`find_view_set`), without `cameras` and `data`. Default without any of the
+            three: the eight virtual views of `psnr`, 640×480, on black.
         source_index: [N] the index in A of each splat of B.
         lpips: a file of LPIPS weights, or `auto` for the usual places; `None`: LPIPS is not computed.
         pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference; or PAGE.html,
@@ -208,12 +208,14 @@ def compare(
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
-        CsplatError: a file is not valid, or an output exists; there are no test views; the renderer is not installed;
-            the disk is full, or too little memory is allowed.
+        CsplatError: a file is not valid, or an output exists; there are no test views, or views are given twice; the
+            renderer is not installed; the disk is full, or too little memory is allowed.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
     bound = context.memory_limit
+    if views is not None and (cameras is not None or data is not None):
+        raise InputError("views are given, and cameras or data, expected only one of them")
     require_renderer()
     if pictures is not None:
         require_images()
@@ -376,7 +378,7 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
 def _views(
     source: Scene,
     cameras: str | os.PathLike[str] | None,
-    data: str | DataOptions | None,
+    data: str | os.PathLike[str] | DataOptions | None,
     background: Colour | None,
     context: Context,
 ) -> ViewSet:
@@ -385,7 +387,7 @@ def _views(
     return find_view_set(
         model,
         cameras=None if cameras is None else os.fspath(cameras),
-        data=DataOptions(data) if isinstance(data, str) else data,
+        data=DataOptions(os.fspath(data)) if isinstance(data, (str, os.PathLike)) else data,
         background=background,
         count=0,
         every=every,
@@ -519,6 +521,7 @@ class _Page:
 
     def write(self, source: Scene, other: Scene, quality: Scores) -> None:
         """Write the page, with the sizes of A and B and the PSNR of each view."""
+        remarks = [f"{format_bytes(scene.size_bytes)}, {counted(scene.count, 'splat')}" for scene in (source, other)]
         views = []
         for number, panels in self._views.items():
             titles = (
@@ -526,9 +529,6 @@ class _Page:
                 f"file, {quality.each[number].psnr:.1f} dB",
                 f"difference × {self._amplification:g}",
             )
-            remarks = [
-                f"{format_bytes(scene.size_bytes)}, {counted(scene.count, 'splat')}" for scene in (source, other)
-            ]
             described = zip(panels, titles, [*remarks, ""], strict=True)
             views.append([replace(panel, title=title, remark=remark) for panel, title, remark in described])
         about = "Images are compressed for this page; scores are not measured on them."
