@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptions of files with contents of unknown types, which no encoder writes."""
+"""Descriptions of files: contents of unknown types, which no encoder writes, and boxes."""
 
-from csplat import _spec
+import numpy as np
+from checked import cloud
+
+from csplat import EncodeOptions, _spec, decode, encode
 from csplat_conformance.manifest import VECTORS
 from csplat_tools.inspect.file_description import FileDescription, describe_file
 
@@ -30,3 +33,19 @@ def test_layers_of_unknown_ids_are_not_counted_as_frames():
     known_count = len(layers) - len(payloads)
     assert len(payloads) * _spec.CHUNK_HEADER_SIZE + sum(payloads) == file.overhead["unknown_layers"]
     assert known_count * _FRAME_SIZE == file.overhead["tile_frames"]
+
+
+def test_the_box_is_around_all_centres_and_most_of_it_is_without_far_splats():
+    means = np.random.default_rng(1).normal(size=(3000, 3))
+    means[0] = (900.0, -800.0, 700.0)
+    data = encode(cloud(means), EncodeOptions(tile_splats=100))
+    file, means = describe_file(data), decode(data).means
+    assert [*means.min(axis=0).tolist(), *means.max(axis=0).tolist()] == file.box()
+    most = np.reshape(file.box(0.9), (2, 3))
+    assert np.all(most[1] - most[0] < 20)
+    inside = np.all((means >= most[0]) & (means <= most[1]), axis=1)
+    assert inside.mean() > 0.5
+
+
+def test_without_splats_there_is_no_box():
+    assert described_vector("empty").box() is None

@@ -34,8 +34,9 @@ def extract(
     Tiles that touch the box are copied unchanged, with up to 65,536 splats
     each: some splats around the box are copied, too. `csplat convert --crop`
     cuts splat by splat. Corners are relative to the origin, along the axes of
-    the file. Declared errors are left out. Of a URL (https, s3 and others) only
-    the index and the copied tiles are fetched; that requires the remote extra.
+    the file, like the box that `csplat info` prints. Declared errors are left
+    out. Of a URL (https, s3 and others) only the index and the copied tiles
+    are fetched; that requires the remote extra.
 
     Examples:
       csplat extract city.csplat square.csplat --box -10,-2,-10,10,8,10

@@ -29,6 +29,7 @@ from csplat.decoder import (
     read_options,
 )
 from csplat.decoder.container import EXTRA_LAYERS
+from csplat.decoder.reconstruct import tile_boxes
 from csplat.decoder.tree import read_nodes
 from csplat.disk_files import finite_or_none, size_on_disk
 from csplat.errors import FormatError
@@ -40,6 +41,7 @@ from csplat_tools.scene_files import findings_as_json
 
 _NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
 _STREAM_CLAUSE = "STR-6"
+_MOST = 0.9  # share of the tiles that "box of most" covers on each side of each axis
 _OFFSET_SIZE = 4  # bytes of a column's offset, i32
 
 
@@ -175,6 +177,23 @@ class FileDescription:
         }
         return {name: Span(min(values), max(values)) for name, values in columns.items() if values}
 
+    def box(self, share: float = 1.0) -> list[float] | None:
+        """Return a box around the centres of splats, in scene units relative to the origin, as `--box` takes it.
+
+        Args:
+            share: share of the tiles of level 0 whose sides it covers on each side of each axis, 0 to 1: with less
+                than 1, far splats do not stretch it.
+
+        Returns:
+            x, y, z of the smallest corner, then of the largest; `None` without splats.
+        """
+        boxes = tile_boxes(self.header, self.header.tiles)
+        if not len(boxes):
+            return None
+        low = np.quantile(boxes[:, 0], 1 - share, axis=0, method="higher")
+        high = np.quantile(boxes[:, 1], share, axis=0, method="lower")
+        return [*low.tolist(), *high.tolist()]
+
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
         header, tiles = self.header, self.header.tiles
@@ -192,6 +211,7 @@ class FileDescription:
             "up": None if up is None else list(up),
             "unit_metres": header.unit_metres,
             "origin": list(header.origin),
+            "box": self.box(),
             "kernel": header.kernel,
             "projection": _spec.PROJECTION_NAMES.get(header.projection, header.projection),
             "antialiasing": _spec.ANTIALIASING_NAMES.get(header.antialiasing, header.antialiasing),
@@ -358,6 +378,7 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
     """Describe the scene in words, by title."""
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata)
+    words |= _describe_boxes(file)
     words["tiles"] = _describe_tiles(file)
     if header.extras:
         words["extra"] = ", ".join(map(_describe_column, header.extras))
@@ -649,6 +670,13 @@ def _registered_name(names: Mapping[int, str], id_: int, what: str, offset: int)
     if id_ not in names:
         raise FormatError(_spec.ERROR_UNSUPPORTED, offset, "RES-2", found=f"{what} {id_}")
     return names[id_]
+
+
+def _describe_boxes(file: FileDescription) -> dict[str, str]:
+    """Return the box of all splats, and if there are tiles enough the box of most, as `--box` and `--crop` take them."""
+    shares = {"box": 1.0, "box of most": _MOST} if len(file.header.tiles) >= 1 / (1 - _MOST) else {"box": 1.0}
+    boxes = {title: file.box(share) for title, share in shares.items()}
+    return {title: ",".join(f"{value:.4g}" for value in box) for title, box in boxes.items() if box is not None}
 
 
 def _describe_tiles(file: FileDescription) -> str:
