@@ -19,12 +19,12 @@ from csplat_trainer.training_loop import time_step
 from csplat_trainer.training_options import TrainOptions
 
 #: Factor of the time of a step of a trained scene, next to one of as many initial splats, which overlap less.
-TRAINED = 1.25
+TRAINED = 1.15
 #: Time that pruning, codebooks and tuning of a file take, as a fraction of the time of its training.
-_FILE = 0.3
-_STEPS_FRACTION = 0.9  # fraction of the time for steps; the rest reads images, times steps, scores and writes
+_FILE = 0.25
+_STEPS_FRACTION = 0.95  # fraction of the time for steps; the rest reads images, times steps, scores and writes
 
-_SPLATS = (5_000, 80_000)  # numbers of splats at which steps are timed
+_SPLATS = (20_000, 150_000)  # numbers of splats at which steps are timed
 _PIXELS = (1 << 16, 1 << 20)  # largest numbers of pixels at which steps are timed
 _SCALES = (1.0, 0.5, 0.25, 0.125)  # candidates for the size of images, as factors of width and height
 _LEAST_SIDE = 100  # pixels of images that are scaled down, at least
