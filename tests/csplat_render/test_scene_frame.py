@@ -2,10 +2,12 @@
 """Tests of csplat_render.scene_frame."""
 
 import numpy as np
+import pytest
 from cameras_cases import ball, figure, niche
 from checked import cloud
 
-from csplat_render.scene_frame import scene_frame, weighted_quantiles
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.scene_frame import Cloud, detail, scene_frame, weighted_quantiles
 
 
 def test_objects_and_surroundings_are_distinguished():
@@ -36,3 +38,25 @@ def test_weighted_quantiles_agree_with_values_by_hand():
     assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, np.ones(5), (0.2, 0.6, 1.0)))
     weights = np.array([1.0, 3.0, 0.0, 0.0, 0.0])  # weights of the values 5 and 1
     assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, weights, (0.75, 0.875, 1.0)))
+
+
+def test_detail_is_what_nearer_points_of_a_cell_let_through():
+    rng = np.random.default_rng(5)
+    points = np.concatenate([rng.normal(size=(400, 3)) * 1e-3, rng.normal(size=(400, 3))])  # many share a cell
+    surface = Cloud(np.asfortranarray(points), rng.random(800) * 1e-2, np.full(800, 0.02))
+    camera = look_at(
+        np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), intrinsics(200, 200, 50.0), 200, 200, 0.1
+    )
+    focal, seen = camera.K[0, 0], 0.0
+    transmittance = {}
+    for index in np.argsort(points[:, 2]):
+        x, y, z = camera.viewmat[:3, :3] @ points[index] + camera.viewmat[:3, 3]
+        place = int((focal * x / z + 100) // 20), int((focal * y / z + 100) // 20)
+        if not all(0 <= part < 10 for part in place):
+            continue
+        depth = surface.masses[index] * (focal / z / 20) ** 2
+        left = transmittance.get(place, 1.0)
+        transmittance[place] = left * np.exp(-depth)
+        seen += (left - transmittance[place]) * 4.0 / max(4.0, surface.sizes[index] * focal / z)
+    assert seen / 100 == pytest.approx(detail(surface, camera, 0.0), rel=1e-9)
+    assert 0.0 < seen

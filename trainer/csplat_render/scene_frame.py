@@ -198,12 +198,13 @@ def detail(cloud: Cloud, camera: Camera, nearest: float, cell: int = 20, fine: f
     cells, z, depths, sizes = _project_cloud(cloud, camera, cell)
     if len(cells) == 0:
         return 0.0
-    order = np.lexsort((z, cells))
+    order = _by_cell_and_depth(cells, z)
     cells, z, depths, sizes = cells[order], z[order], depths[order], sizes[order]
     behind = np.cumsum(depths)
     before = behind - depths
-    first = np.searchsorted(cells, cells, side="left")
-    seen = np.exp(before[first] - before) * -np.expm1(-depths)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))  # the nearest point of each cell
+    in_front = np.repeat(before[starts], np.diff(starts, append=len(cells))) - before
+    seen = np.exp(in_front) * -np.expm1(-depths)
     shown = np.where(z < nearest, 0.0, fine / np.maximum(sizes, fine))
     return float(np.sum(seen * shown)) / _cell_count(camera, cell)
 
@@ -282,6 +283,25 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
     cells = v[inside].astype(np.int64) // cell * columns + u[inside].astype(np.int64) // cell
     scale = camera.K[0, 0] / z
     return cells, z, cloud.masses[inside] * (scale / cell) ** 2, cloud.sizes[inside] * scale
+
+
+def _by_cell_and_depth(cells: I64, z: F64) -> I64:
+    """Return the order of points by cell, then by depth, to about seven digits, then as given.
+
+    One integer holds cell, leading bits of the depth, and index; sorting integers is ten times as fast as `lexsort`.
+
+    Args:
+        cells: [n], not negative, n at least 1.
+        z: [n], positive.
+    """
+    index_bits, cell_bits = len(z).bit_length(), max(1, int(cells.max()).bit_length())
+    depth_bits = 64 - index_bits - cell_bits
+    keys = cells.astype(np.uint64) << np.uint64(index_bits + depth_bits)
+    keys |= z.view(np.uint64) >> np.uint64(63 - depth_bits) << np.uint64(index_bits)  # the sign bit is 0
+    keys |= np.arange(len(z), dtype=np.uint64)
+    keys.sort()
+    order: I64 = (keys & np.uint64(2**index_bits - 1)).astype(np.int64)
+    return order
 
 
 def _clipped_scales(model: SplatModel) -> F64:
