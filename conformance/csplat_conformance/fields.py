@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from csplat import _spec
@@ -38,8 +39,7 @@ class Writer:
     def structure(self, name: str, structure: str, values: Iterable[Any]) -> None:
         """Append a structure of the registry, with fields named `name.field`."""
         packer: struct.Struct = getattr(_spec, f"{structure.upper()}_STRUCT")
-        offsets: dict[str, int] = getattr(_spec, f"{structure.upper()}_OFFSETS")
-        for key, (offset, code) in _split_format(packer.format, offsets).items():
+        for key, (offset, code) in _fields_of(structure).items():
             self.fields[f"{name}.{key}"] = Field(len(self.data) + offset, code, structure)
         flat = [v for value in values for v in (value if isinstance(value, tuple) else (value,))]
         self.data += packer.pack(*flat)
@@ -124,12 +124,15 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
     return out.fields, dict(sorted(spans.items(), key=lambda item: item[1]))
 
 
-def _split_format(packed: str, offsets: dict[str, int]) -> dict[str, tuple[int, str]]:
-    """Split a struct format at the offsets of the fields; return offset and format of each field by name.
+@cache
+def _fields_of(structure: str) -> dict[str, tuple[int, str]]:
+    """Return offset and struct format of each field of a structure of the registry, by name.
 
     A field has all codes up to the offset of the next field. The first field is at offset 0.
     """
-    codes = re.findall(r"\d*[a-zA-Z]", packed.lstrip("<"))
+    packer: struct.Struct = getattr(_spec, f"{structure.upper()}_STRUCT")
+    offsets: dict[str, int] = getattr(_spec, f"{structure.upper()}_OFFSETS")
+    codes = re.findall(r"\d*[a-zA-Z]", packer.format.lstrip("<"))
     result: dict[str, tuple[int, str]] = {}
     at, name = 0, ""
     starts = {offset: key for key, offset in offsets.items()}

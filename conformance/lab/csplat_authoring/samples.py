@@ -64,7 +64,7 @@ def quat_rows(seed: int, n: int, m: int = _LEVELS_QUATS) -> list[list[int]]:
 
 def levels(values: Sequence[int], stream_coding: Stream = PLAIN) -> Block:
     """Return a block coded LEVELS."""
-    return Block(_spec.CODING_LEVELS, [[value] for value in values], stream_coding)
+    return Block(_spec.CODING_LEVELS, [*zip(values, strict=True)], stream_coding)
 
 
 def morton(rows: Rows, bits: int, stream_coding: Stream = PAIRS) -> Block:

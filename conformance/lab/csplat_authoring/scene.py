@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from csplat import _spec
 
@@ -265,4 +266,4 @@ def band_of(attribute: int) -> int:
 
 def transpose(rows: Rows) -> list[int]:
     """Return the values of column 0, then those of column 1, and so on."""
-    return [value for column in zip(*rows, strict=True) for value in column]
+    return [*chain.from_iterable(zip(*rows, strict=True))]
