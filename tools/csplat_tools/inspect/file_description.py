@@ -673,7 +673,7 @@ def _registered_name(names: Mapping[int, str], id_: int, what: str, offset: int)
 
 
 def _describe_boxes(file: FileDescription) -> dict[str, str]:
-    """Return the box of all splats, and if there are tiles enough the box of most, as `--box` and `--crop` take them."""
+    """Return the box of all splats and, if there are enough tiles, that of most, as `--box` and `--crop` take them."""
     shares = {"box": 1.0, "box of most": _MOST} if len(file.header.tiles) >= 1 / (1 - _MOST) else {"box": 1.0}
     boxes = {title: file.box(share) for title, share in shares.items()}
     return {title: ",".join(f"{value:.4g}" for value in box) for title, box in boxes.items() if box is not None}
