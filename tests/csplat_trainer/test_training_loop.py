@@ -320,11 +320,13 @@ def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_train
     file, damaged = write_set(tmp_path, data) / "transforms.json", tmp_path / "11.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
     monkeypatch.setattr("csplat_trainer.train", lambda *_, **__: pytest.fail("training began"))
-    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.ply", status=1).stderr
+    words = ("--iterations", 5)  # with a time, steps would be timed
+    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.ply", *words, status=1).stderr
     document = json.loads(file.read_text())
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": document["frames"][rows]}))
-    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.csplat", status=1).stderr
+    found = call("train", tmp_path, tmp_path / "a.csplat", *words, status=1).stderr
+    assert "11.png is a PNG that is truncated" in found
     for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
         refused = call("train", tmp_path, tmp_path / "a.ply", *words, status=2).stderr
         assert "expected OUT.csplat" in " ".join(refused.split())
