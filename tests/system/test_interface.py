@@ -297,7 +297,10 @@ def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch):
     from captures import photograph, shell
 
     monkeypatch.chdir(photograph(shell(3), tmp_path))
-    for words, kind in (("train . a.ply --iterations 5", "DataSet"), ("finetune scene.ply a.csplat --data .", "SplatModel")):
+    for words, kind in (
+        ("train . a.ply --iterations 5", "DataSet"),
+        ("finetune scene.ply a.csplat --data .", "SplatModel"),
+    ):
         (given, *_), _ = arguments_of(monkeypatch, csplat_trainer, words.split()[0], words.split())
         assert kind == type(given).__name__
 
