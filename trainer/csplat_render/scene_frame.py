@@ -288,7 +288,7 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
 def _by_cell_and_depth(cells: I64, z: F64) -> I64:
     """Return the order of points by cell, then by depth, to about seven digits, then as given.
 
-    One integer holds cell, leading bits of the depth, and index; sorting integers is ten times as fast as `lexsort`.
+    One integer holds cell, leading bits of the depth, and index: sorting integers is faster than `lexsort`.
 
     Args:
         cells: [n], not negative, n at least 1.
