@@ -23,13 +23,13 @@ from csplat.types import F64
 from csplat_render.camera import Camera, central_camera, direction_at, intrinsics, look_at
 from csplat_render.camera_paths import ELEVATION, main_parts, orbit_framing
 from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
-from csplat_render.up_estimate import estimate_up
+from csplat_render.up_estimate import POINTS_PER_SPLAT, estimate_up
 from csplat_render.virtual_cameras import HIDING
 
 #: Largest number of splats that the choice considers; all of a million would take 1.4 CPU s.
 SAMPLE_SPLATS = 50_000
 
-_POINTS = 16_000  # cloud points
+_POINTS = 16_000  # cloud points, but at most POINTS_PER_SPLAT for each splat
 _USUAL_UP = (0.0, -1.0, 0.0)  # what viewers assume of scenes of unknown axes
 _FIELD_OF_VIEW = 50.0  # degrees, of a square image: viewers fit all of it into their canvas, wide or tall
 _SIDE = 640  # pixels of the image's side
@@ -80,7 +80,7 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     known = [] if frame.kind == "object" else cameras or _cameras_of(metadata)
     if known:
         return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))
-    cloud = sample_cloud(model, _POINTS, np.random.default_rng(0), every)
+    cloud = sample_cloud(model, min(_POINTS, POINTS_PER_SPLAT * len(model)), np.random.default_rng(0), every)
     try:
         return metadata.with_entries(view=view_entry(_estimate(metadata, cloud, frame), ESTIMATE))
     except InputError:

@@ -17,9 +17,12 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_render.virtual_cameras import FIELD_OF_VIEW
 
+#: Cloud points for each splat of a small scene; more show no more of it.
+POINTS_PER_SPLAT = 32
+
 _UP_CERTAIN = 0.3  # minimum length of a conclusive sum
 _UP_NEAR_AXIS = 0.9  # minimum cosine with an axis: programs use one of their axes as up
-_UP_POINTS = 10_000  # cloud points
+_UP_POINTS = 10_000  # cloud points, but at most POINTS_PER_SPLAT for each splat
 _UP_DIRECTIONS = 32  # number of views
 _UP_IMAGE_SIZE = 320  # pixels, width and height of the views
 _UP_DISTANCE = 2.0  # extents, from the centre
@@ -41,7 +44,7 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
     frame = scene_frame(model)
     if frame.kind != "object":
         return None
-    cloud = sample_cloud(model, _UP_POINTS, np.random.default_rng(0), every)
+    cloud = sample_cloud(model, min(_UP_POINTS, POINTS_PER_SPLAT * len(model)), np.random.default_rng(0), every)
     K = intrinsics(_UP_IMAGE_SIZE, _UP_IMAGE_SIZE, FIELD_OF_VIEW)
     heights = 1.0 - (2.0 * np.arange(_UP_DIRECTIONS) + 1.0) / _UP_DIRECTIONS  # spiral that covers the sphere evenly
     turns, radii = np.pi * (1.0 + 5.0**0.5) * np.arange(_UP_DIRECTIONS), np.sqrt(1.0 - heights**2)
