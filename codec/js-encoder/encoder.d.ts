@@ -1,7 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Types of csplat-encoder. N is the number of splats, K = (degree + 1)² − 1 for SH of degree 0 to 4.
 
-/** A scene, such as csplat-decoder's `decode` returns. All numbers are finite. */
+/**
+ * A scene, such as csplat-decoder's `decode` returns. All numbers are finite. Extra columns, cameras and declared errors are
+ * left out.
+ */
 export interface Splats {
   /** [N, 3], centres in scene units, relative to `origin` */
   means: Float32Array;
@@ -31,10 +34,12 @@ export interface Splats {
   colourSpace?: number;
   /** Title, licence, up direction and other keys of META (specification, 5.4). Default: none. */
   metadata?: Record<string, unknown> | null;
+  /** Of a decoded scene: states what of origin, axes, unitMetres, antialiased, flat and colourSpace is not stated above. */
+  header?: Pick<Splats, 'origin' | 'axes' | 'unitMetres' | 'antialiased' | 'flat' | 'colourSpace'>;
 }
 
 /** The splats of a PLY. */
-export interface PlySplats extends Required<Omit<Splats, 'metadata'>> {
+export interface PlySplats extends Required<Omit<Splats, 'metadata' | 'header'>> {
   /** Rows of the file; those with NaN or infinity are left out. */
   rowCount: number;
 }

@@ -72,7 +72,11 @@ async function run(task, input, options) {
 }
 
 /** @param {Splats} splats @param {EncodeOptions} [options] */
-export const encode = (splats, options = {}) => run('encode', splats, options);
+export function encode(splats, options = {}) {
+  const { header = {}, ...stated } = splats;
+  const { origin, axes, unitMetres, antialiased, flat, colourSpace } = header;
+  return run('encode', { origin, axes, unitMetres, antialiased, flat, colourSpace, ...stated }, options);
+}
 
 /** @param {ArrayBuffer | Uint8Array} ply @param {EncodeOptions} [options] */
 export const readPly = (ply, options = {}) => run('readPly', ply, options);

@@ -69,6 +69,11 @@ test('states fields and metadata', async () => {
   const { origin, axes, unitMetres, antialiased, flat, colourSpace } = scene.header;
   assert.deepEqual({ origin, axes, unitMetres, antialiased, flat, colourSpace }, fields);
   assert.deepEqual(scene.metadata, { title: 'Zürich' });
+  for (const worker of [false, true]) {
+    const again = await decode((await encode(scene, { worker })).buffer);
+    assert.deepEqual([again.header.origin, again.header.axes, again.header.flat], [origin, axes, flat]);
+    assert.deepEqual((await decode((await encode({ ...scene, axes: 'RUB' }, { worker })).buffer)).header.axes, 'RUB');
+  }
 });
 
 test('reports progress, and stops', async () => {
