@@ -79,6 +79,7 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing, fail if a file is outdated")
     check = parser.parse_args().check
     registry = tomllib.loads(REGISTRY.read_text(encoding="utf-8"))
+    version = version_of(VERSIONED.read_text(encoding="utf-8"))
     targets = {
         PYTHON: python_module(registry),
         RULES: rules_module(registry),
@@ -86,11 +87,10 @@ def main() -> int:
         TYPES: with_types(TYPES.read_text(encoding="utf-8"), registry),
         C: with_c_error_names(with_c_numbers(C.read_text(encoding="utf-8"), registry), registry),
         C_ENCODER: with_c_numbers(C_ENCODER.read_text(encoding="utf-8"), registry),
-        C_HEADER: with_c_codes(C_HEADER.read_text(encoding="utf-8"), registry),
+        C_HEADER: with_c_codes(C_HEADER.read_text(encoding="utf-8"), registry, version),
         **with_tables({path: path.read_text(encoding="utf-8") for path in DOCUMENTS}, registry),
         SHADERS: shader_module(sorted(WGSL.glob("*.wgsl"))),
     }
-    version = version_of(VERSIONED.read_text(encoding="utf-8"))
     targets |= {path: with_version(path, line, version) for path, line in VERSION_LINES.items()}
     stale = []
     for path, text in targets.items():
@@ -531,15 +531,17 @@ def with_c_error_names(text: str, registry: Registry) -> str:
     )
 
 
-def with_c_codes(text: str, registry: Registry) -> str:
-    """Return the text of codec/c/csplat.h with updated limits and error codes."""
+def with_c_codes(text: str, registry: Registry, version: str) -> str:
+    """Return the text of codec/c/csplat.h with updated version, limits and error codes."""
     values = {c["name"]: c["value"] for c in registry["constant"]}
     limits = (
+        f'#define CSPLAT_VERSION "{version}" /* of this header; csplat_version returns that of the library */\n'
         f"#define CSPLAT_TILE_SPLATS {values['tile_splats_max']} /* maximum splats per tile */\n"
         f"#define CSPLAT_SH_DEGREE_MAX {values['sh_degree_max']}   /* maximum SH degree */\n"
     )
-    text = between(text, "/* begin generated: limits */\n", limits, "/* end generated */")
-    codes = [f"    CSPLAT_{e['id']}, /* {e['text']} */\n" for e in enum_named(registry, "error")["entries"]]
+    text = between(text, "/* begin generated: version and limits */\n", limits, "/* end generated */")
+    entries = enumerate(enum_named(registry, "error")["entries"], 1)
+    codes = [f"    CSPLAT_{e['id']} = {number}, /* {e['text']} */\n" for number, e in entries]
     return between(text, "/* begin generated: error codes */\n", "".join(codes), "    /* end generated */")
 
 

@@ -537,6 +537,11 @@ const char *csplat_code_name(csplat_code code)
     return (size_t)code < sizeof names / sizeof *names ? names[code] : "";
 }
 
+const char *csplat_version(void)
+{
+    return CSPLAT_VERSION;
+}
+
 /* Note an error. */
 static void note(csplat *d, csplat_code code, const char *clause, uint64_t offset, const char *format, ...)
 {

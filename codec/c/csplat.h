@@ -16,7 +16,10 @@
  *
  * There is no global state. A csplat belongs to one thread at a time; threads can each open one on the same bytes.
  * Every function that can fail returns CSPLAT_OK, which is 0, or the code of the specification. After a failure the
- * csplat can still be used. */
+ * csplat can still be used.
+ *
+ * Later versions add members at the end of structs and codes at the end of the list: set unused members to 0, and compile
+ * again for another minor version. */
 #ifndef CSPLAT_H
 #define CSPLAT_H
 
@@ -27,7 +30,8 @@
 extern "C" {
 #endif
 
-/* begin generated: limits */
+/* begin generated: version and limits */
+#define CSPLAT_VERSION "1.0.0" /* of this header; csplat_version returns that of the library */
 #define CSPLAT_TILE_SPLATS 65536 /* maximum splats per tile */
 #define CSPLAT_SH_DEGREE_MAX 4   /* maximum SH degree */
 /* end generated */
@@ -40,23 +44,23 @@ typedef struct csplat csplat;
 typedef enum csplat_code {
     CSPLAT_OK = 0,
     /* begin generated: error codes */
-    CSPLAT_E_MAGIC, /* the file does not begin with the magic, or a text-mode transfer damaged it */
-    CSPLAT_E_VERSION, /* another version of the format */
-    CSPLAT_E_TRUNCATED, /* the data ends before what it announces */
-    CSPLAT_E_TRAILING, /* bytes follow the end of the file */
-    CSPLAT_E_CRC, /* a CRC-32 does not match */
-    CSPLAT_E_RESERVED, /* a reserved field or bit is not 0 */
-    CSPLAT_E_VALUE, /* a field holds a forbidden value */
-    CSPLAT_E_INDEX, /* index and chunks contradict each other */
-    CSPLAT_E_UNSUPPORTED, /* a profile, type or coding that this version or this decoder does not have */
-    CSPLAT_E_STREAM, /* a stream header contradicts its place */
-    CSPLAT_E_CODER, /* coded bytes are damaged, end early or late, or do not give the declared size */
-    CSPLAT_E_RANGE, /* a decoded integer or value is out of range */
-    CSPLAT_E_CODEBOOK, /* an index, a count or a codebook that does not fit */
-    CSPLAT_E_BOX, /* a tile's record does not describe its splats */
-    CSPLAT_E_JSON, /* a JSON chunk is not UTF-8 JSON of the right kind */
-    CSPLAT_E_LIMIT, /* a budget, of the decoder or of a cut, is too small */
-    CSPLAT_E_INPUT, /* the caller's data or arguments, not a file, are at fault */
+    CSPLAT_E_MAGIC = 1, /* the file does not begin with the magic, or a text-mode transfer damaged it */
+    CSPLAT_E_VERSION = 2, /* another version of the format */
+    CSPLAT_E_TRUNCATED = 3, /* the data ends before what it announces */
+    CSPLAT_E_TRAILING = 4, /* bytes follow the end of the file */
+    CSPLAT_E_CRC = 5, /* a CRC-32 does not match */
+    CSPLAT_E_RESERVED = 6, /* a reserved field or bit is not 0 */
+    CSPLAT_E_VALUE = 7, /* a field holds a forbidden value */
+    CSPLAT_E_INDEX = 8, /* index and chunks contradict each other */
+    CSPLAT_E_UNSUPPORTED = 9, /* a profile, type or coding that this version or this decoder does not have */
+    CSPLAT_E_STREAM = 10, /* a stream header contradicts its place */
+    CSPLAT_E_CODER = 11, /* coded bytes are damaged, end early or late, or do not give the declared size */
+    CSPLAT_E_RANGE = 12, /* a decoded integer or value is out of range */
+    CSPLAT_E_CODEBOOK = 13, /* an index, a count or a codebook that does not fit */
+    CSPLAT_E_BOX = 14, /* a tile's record does not describe its splats */
+    CSPLAT_E_JSON = 15, /* a JSON chunk is not UTF-8 JSON of the right kind */
+    CSPLAT_E_LIMIT = 16, /* a budget, of the decoder or of a cut, is too small */
+    CSPLAT_E_INPUT = 17, /* the caller's data or arguments, not a file, are at fault */
     /* end generated */
 } csplat_code;
 
@@ -278,6 +282,9 @@ csplat_code csplat_check(csplat *file);
 
 /* "E_CRC" */
 const char *csplat_code_name(csplat_code code);
+
+/* "1.0.0" */
+const char *csplat_version(void);
 
 /* An inflate for csplat_options, in inflate.c. */
 int csplat_inflate(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
