@@ -74,6 +74,9 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     project = tmp_path / "pyproject.toml"
+    (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n", "utf-8")
+    assert 1 == prepared(f"v{csplat.__version__}", "https://github.com/owner/csplat")
+    (tmp_path / "CHANGELOG.md").write_text(f"## [{csplat.__version__}] - 2027-01-01\n", "utf-8")
     text, before = project.read_bytes(), tomllib.loads(project.read_text("utf-8"))
     assert 1 == prepared("v9.9.9", "https://github.com/owner/csplat")
     with pytest.raises(SystemExit):
@@ -111,4 +114,4 @@ def test_the_readme_of_the_package_needs_no_checkout():
         "## Licence",
     ):
         assert words in shown
-    assert [] == re.findall(r"!\[|\]\((?!https://)|not on PyPI|make demo", shown)
+    assert [] == re.findall(r"!\[|\]\((?!https://)|make demo|CSPLAT_NATIVE", shown)

@@ -43,6 +43,8 @@ SOURCES = {
     "gltf-assets.md": "conformance/gltf/README.md",
     "conformance.md": "conformance/README.md",
     "clauses.md": "conformance/CLAUSES.md",
+    "interface.md": "API.md",
+    "security.md": "SECURITY.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prepare the packages of a release: check the tag, and write the address of the repository into their metadata.
+"""Prepare the packages of a release: check tag and changelog, and write the repository's address into their metadata.
 
 The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v1.0.0 URL=https://…`
 calls this before it builds. npm accepts a provenance only if `repository` in package.json is where it was built.
@@ -20,7 +20,7 @@ _PACKAGES = ("codec/js", "codec/js-encoder")  # of npm
 
 
 def main(words: list[str] | None = None, root: Path = ROOT) -> int:
-    """Change pyproject.toml and both package.json in place; the status is 1 for a tag of another version."""
+    """Change pyproject.toml and both package.json in place; status 1: tag or changelog have another version."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tag", required=True, help="`v` and the version")
     parser.add_argument("--url", required=True, help="of the repository, https")
@@ -32,6 +32,9 @@ def main(words: list[str] | None = None, root: Path = ROOT) -> int:
     version = re.findall(r'(?m)^__version__ = "(.+)"$', (root / "codec/csplat/__init__.py").read_text("utf-8"))[0]
     if args.tag != f"v{version}":
         sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, as codec/csplat/__init__.py states\n")
+        return 1
+    if f"## [{version}]" not in (root / "CHANGELOG.md").read_text("utf-8"):
+        sys.stderr.write(f"error: CHANGELOG.md has no section [{version}]\n")
         return 1
     project.write_text(with_links(with_urls(text, args.url), f"{args.url}/blob/{args.tag}"), "utf-8", newline="\n")
     for folder in _PACKAGES:
