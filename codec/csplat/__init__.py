@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from csplat.context import Context
-    from csplat.decoder import decode, decode_integers, decode_scene, read_header
+    from csplat.decoder import Limits, decode, decode_integers, decode_scene, read_header
     from csplat.editing.extract import extract
     from csplat.editing.merge import merge
     from csplat.encode_api import encode, encode_with_report
@@ -70,6 +70,7 @@ __all__ = [
     "FormatError",
     "InputError",
     "LimitError",
+    "Limits",
     "Scene",
     "SceneMetadata",
     "SearchInterrupted",
@@ -138,6 +139,7 @@ _MODULE_OF = {
     "FormatError": "csplat.errors",
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
+    "Limits": "csplat.decoder",
     "Scene": "csplat.scene",
     "SearchInterrupted": "csplat.errors",
     "SceneMetadata": "csplat.scene_metadata",

@@ -46,6 +46,9 @@ class FormatError(CsplatError):
         wanted: value that the clause requires.
     """
 
+    offset: int | None
+    clause: str
+
     def __init__(
         self,
         code: str,
@@ -76,6 +79,10 @@ class UnsupportedError(CsplatError):
         clause: id of the clause, if any.
     """
 
+    feature: str
+    offset: int | None
+    clause: str
+
     def __init__(self, feature: str, code: str = "E_UNSUPPORTED", offset: int | None = None, clause: str = "") -> None:
         super().__init__(feature, code, offset, clause)
         self.code = code
@@ -98,6 +105,12 @@ class LimitError(CsplatError):
         offset: offset of the field in the file, if known.
         clause: id of the clause, if any.
     """
+
+    limit: str
+    wanted: int | str
+    allowed: int | str | None
+    offset: int | None
+    clause: str
 
     def __init__(
         self,
@@ -157,6 +170,8 @@ class SearchInterrupted(KeyboardInterrupt):
         best: the best result so far that meets the target, of the type that the interrupted function returns; `None` if
             none does.
     """
+
+    best: Any
 
     def __init__(self, message: str, best: Any = None) -> None:
         super().__init__(message)

@@ -67,7 +67,7 @@ def test_a_scene_is_seen_by_two_cameras_of_a_camera_file_and_not_dark():
             camera, picture = view["camera"], read_png((VECTORS / view["picture"]).read_bytes())
             assert (camera["H"], camera["W"], 3) == picture.shape
             assert psnr(picture, np.zeros_like(picture)) < 25
-            assert camera == json.loads(json.dumps(Camera.from_json(camera).to_json()))
+            assert camera == json.loads(json.dumps(Camera.from_json(camera).as_json()))
 
     assert [] == failures(RENDERED, check)
 

@@ -112,7 +112,7 @@ def test_the_number_of_threads_does_not_change_the_cameras(sample_path):
     code = (
         "import json, sys, csplat, numpy as np; from csplat_render.virtual_cameras import virtual_cameras\n"
         "model = csplat.read(sys.argv[1]).select(np.arange(20_000) % 8_000)\n"
-        "print(json.dumps([camera.to_json() for camera in virtual_cameras(model)]))"
+        "print(json.dumps([camera.as_json() for camera in virtual_cameras(model)]))"
     )
     words = [sys.executable, "-c", code, str(sample_path)]
     one, two = (

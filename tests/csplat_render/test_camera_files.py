@@ -27,13 +27,13 @@ def test_saved_cameras_are_loaded_exactly_and_near_and_image_may_be_left_out(tmp
         look_at([-3.0, 0.3, 1.0], [0.0, 0.0, 0.2], UP, K, 320, 200),
     ]
     save_cameras(tmp_path / "c.json", cameras)
-    assert [camera.to_json() for camera in cameras] == [c.to_json() for c in load_cameras(tmp_path / "c.json")]
+    assert [camera.as_json() for camera in cameras] == [c.as_json() for c in load_cameras(tmp_path / "c.json")]
     least = {"K": K.tolist(), "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
     for further in ({}, {"background": [1.0, 1.0, 1.0]}):  # unknown keys are ignored
         (bare,) = load_cameras(written(tmp_path, [least | further]))
         assert (0.2, None) == (bare.near, bare.image)
     (alone,) = load_cameras(written(tmp_path, least))  # as the element's `camera` gives it
-    assert bare.to_json() == alone.to_json()
+    assert bare.as_json() == alone.as_json()
 
 
 def test_cameras_relative_to_the_origin_or_to_0_are_distinguished(tmp_path):

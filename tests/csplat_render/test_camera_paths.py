@@ -84,7 +84,7 @@ def test_a_path_along_cameras_has_their_positions_and_directions(spread):
     assert np.linalg.norm(middle - places.mean(axis=0)) < 0.4
     far = look_at([0, 5000.0, 0], [0, 0, 0], [0, 0, 1], SMALL_K, 64, 48)
     assert same(cameras, orbit_cameras(niche(), 24, 64, 48, along=[*known, far]))
-    carrying = with_facts(niche(), cameras=[camera.to_json() for camera in known])
+    carrying = with_facts(niche(), cameras=[camera.as_json() for camera in known])
     assert same(cameras, orbit_cameras(carrying, 24, 64, 48))  # the recorded cameras
     for camera in orbit_cameras(niche(), 3, 64, 48, along=known[:1]):  # one camera does not move
         assert np.allclose(known[0].viewmat, camera.viewmat)
@@ -93,7 +93,7 @@ def test_a_path_along_cameras_has_their_positions_and_directions(spread):
 @pytest.mark.slow
 def test_a_path_sways_around_the_recorded_first_view():
     first = look_at([2.4, -0.8, 0.3], [0, 0, 0], [0, -1, 0], SMALL_K, 64, 48)
-    cameras = orbit_cameras(with_facts(niche(), entries={"view": first.to_json(), "up": [0, -1, 0]}), 24, 64, 48)
+    cameras = orbit_cameras(with_facts(niche(), entries={"view": first.as_json(), "up": [0, -1, 0]}), 24, 64, 48)
     places = np.stack([camera.position for camera in cameras])
     assert np.allclose(places.mean(axis=0), first.position, atol=0.25)
     assert np.allclose(np.linalg.norm(places, axis=1), np.linalg.norm(first.position), atol=0.01)

@@ -85,7 +85,7 @@ def test_surroundings_with_cameras_get_the_most_typical_one():
     assert "training" == source
     assert np.allclose(cameras[1].position, camera.position, atol=1e-4)
     assert (64, 48) == (camera.W, camera.H)
-    carried = replace(niche(), metadata=replace(niche().metadata, cameras=[one.to_json() for one in cameras]))
+    carried = replace(niche(), metadata=replace(niche().metadata, cameras=[one.as_json() for one in cameras]))
     assert (camera.viewmat == first_view(carried)[0].viewmat).all()
     assert "estimate" == first_view(ball(), cameras)[1]  # an object is shown whole
     broken = replace(niche(), metadata=replace(niche().metadata, cameras=[{"K": 1}]))

@@ -301,7 +301,7 @@ def test_an_orbit_is_the_same_for_all_levels(path, tmp_path, monkeypatch, framed
     monkeypatch.setattr("csplat_tools.cli.render.render_folder", lambda _, shots, *__, **___: seen.append(shots))
     for level in ("0", "1", "256"):
         invoke("render", path, tmp_path / level, "--orbit", 2, "--level", level)
-    first, *others = ([camera.to_json() for camera in shots] for shots in seen)
+    first, *others = ([camera.as_json() for camera in shots] for shots in seen)
     assert [first, first] == others
 
 

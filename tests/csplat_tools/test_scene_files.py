@@ -59,7 +59,7 @@ def test_blocks_give_the_first_view_of_memory(monkeypatch):
 def test_a_camera_file_gives_the_first_view(tmp_path):
     camera = look_at([0.0, -3.0, 1.0], [0, 0, 0], [0, 0, 1], intrinsics(64, 48, 60.0), 64, 48, image="a.jpg")
     path = tmp_path / "view.json"
-    path.write_text(json.dumps([camera.to_json()]), encoding="utf-8")
+    path.write_text(json.dumps([camera.as_json()]), encoding="utf-8")
     known = with_facts(bowl(), entries={"view": {"from": "estimate"}, "up": [0, 1, 0]})
     entries = with_first_view(Scene.of(known), path).metadata.entries
     assert ([0, 1, 0], "author") == (entries["up"], entries["view"]["from"])

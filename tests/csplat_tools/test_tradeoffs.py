@@ -120,7 +120,7 @@ def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
     photograph(shell(3).select(slice(0, 100)), folder)
     monkeypatch.chdir(tmp_path)
     views = ("--data", "my set", "--json")
-    done = call("tradeoff", "my set/scene.ply", *views, "--what", "presets=fast,targets=3kB", "-o", "page.html")
+    done = call("tradeoff", "my set/scene.ply", *views, "--what", "presets=fast,targets=3kB", "--page", "page.html")
     assert "2/2 targets=3kB: " in done.stderr
     assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
     rows = json.loads(done.stdout)["points"]
@@ -138,13 +138,13 @@ def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
 def test_wrong_words_and_missing_packages_are_refused_before_any_work(sample_path, tmp_path, make_model, monkeypatch):
     (tmp_path / "mine.html").write_text("mine")
     for status, words in (
-        (2, ("--what", "presets=huge")), (2, ("--what", "presets", "--preset", "huge")), (2, ("-o", "-")),
-        (2, ("--data", "x", "--cameras", "y")), (1, ("-o", tmp_path / "mine.html")),
+        (2, ("--what", "presets=huge")), (2, ("--what", "presets", "--preset", "huge")), (2, ("--page", "-")),
+        (2, ("--data", "x", "--cameras", "y")), (1, ("--page", tmp_path / "mine.html")),
     ):  # fmt: skip
         call("tradeoff", sample_path, *words, status=status)
     with pytest.raises(InputError, match="the scene has no splats"):
         tradeoff(make_model(0))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     line = "error: this needs matplotlib, of the extra render: pip install matplotlib (E_INPUT)\n"
-    assert line == call("tradeoff", sample_path, "-o", tmp_path / "report.html", status=1).stderr
+    assert line == call("tradeoff", sample_path, "--page", tmp_path / "report.html", status=1).stderr
     assert hide_renderer(monkeypatch) == call("tradeoff", sample_path, status=1).stderr

@@ -90,7 +90,7 @@ def test_a_scene_is_pruned_and_tuned_to_a_size(monkeypatch):
     monkeypatch.setattr(tuning_run, "SPLAT_BYTES", 15)  # small files have a larger share of overhead
     model = shell(8)
     around = ViewSet("cameras", (0.0, 0.0, 0.0), cameras(6)[:2], (), ())
-    options = FinetuneOptions(iterations=8, validate_every=4, warm_up=2, device="cuda", byte_cost=1e-3)
+    options = FinetuneOptions(iterations=8, validate_every=4, warm_up=2, device="cuda", lambda_=1e-3)
     tuned = choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size=3600))
     assert 2800 < tuned.size_bytes <= 3600
     assert 240 == len(tuned.made.decoded)

@@ -131,7 +131,7 @@ def test_nothing_cancels_within_a_view_whatever_the_number_of_threads():
 @pytest.fixture
 def camera_file(tmp_path):
     path = tmp_path / "cameras.json"
-    path.write_text(json.dumps([camera.to_json() for camera in cameras(3)]))
+    path.write_text(json.dumps([camera.as_json() for camera in cameras(3)]))
     return path
 
 

@@ -196,7 +196,7 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path, monkeypat
     model = decode(first)
     assert 30 == len(report["training"]["losses"])
     assert (len(model), len(first)) == (report["file"]["splats"], report["file"]["size_bytes"])
-    assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
+    assert {"source", "before_tuning", "file"} == set(report["file"]["scores"])
     assert "held-out images" in file_runs.messages
     record = model.metadata.training
     assert (1.0, 1.0, 1.0) == record.background
@@ -309,7 +309,7 @@ def test_a_file_much_smaller_than_its_largest_size_is_explained_by_splats_or_ste
         (700, 25_000, 7_000, "the 700 splats to which 30 steps grew the scene"),
         (20_000, 25_000, 199_000, None),
     ):  # fmt: skip
-        training = {"splat_count": grown, "options": {"max_splats": most, "iterations": 30}}
+        training = {"splats": grown, "options": {"max_splats": most, "iterations": 30}}
         result = {"training": training, "file": {"size_bytes": size_bytes, "splats": grown}}
         lines = explain_size(result, Target(size=200_000))
         assert [text] == [None for _ in range(not lines)] + [text for line in lines if text and text in line]

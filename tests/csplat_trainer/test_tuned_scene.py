@@ -241,7 +241,7 @@ def test_every_learning_rate_warms_up(tmp_path):
     fixed, file, moved = coarse(), tmp_path / "c.npz", []
     start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}
     for warm_up in (0, 100):
-        options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
+        options = FinetuneOptions(iterations=1, warm_up=warm_up, lambda_=0.0)
         tune(fixed, views_of_source(), options, outputs=Outputs(file))
         with np.load(file) as stored:
             steps = {name: np.abs(stored[f"values_{name}"] - start[name]).max() for name in start}

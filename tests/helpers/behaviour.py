@@ -35,6 +35,7 @@ import csplat
 ROOT = Path(__file__).resolve().parents[2]
 GOLDENS = ROOT / "tests" / "system" / "behaviour.json"
 SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
+VECTORS = ROOT / "conformance" / "csplat_conformance" / "vectors"
 PRESETS = ("fast", "balanced", "small")
 #: Scenes that are not in the project; their folder, see tests/conftest.py.
 SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
@@ -139,7 +140,7 @@ def run(*words: str | Path) -> Json:
     """Run a command in this process with --json, and return what it prints.
 
     Raises:
-        AssertionError: its status is not 0.
+        AssertionError: its status is neither 0 nor 1, or it prints nothing.
     """
     from csplat_program import main
 
@@ -155,8 +156,9 @@ def run(*words: str | Path) -> Json:
             except SystemExit as end:
                 status = end.code or 0
         stdout.flush()
-    assert status == 0, f"{' '.join(arguments)}: status {status}\n{stderr.getvalue()}"
-    return json.loads(stdout.buffer.getvalue())
+    printed = stdout.buffer.getvalue()
+    assert status in (0, 1) and printed, f"{' '.join(arguments)}: status {status}\n{stderr.getvalue()}"  # noqa: PT018
+    return json.loads(printed)
 
 
 def digest(data: bytes) -> str:
@@ -212,7 +214,7 @@ def _presets(name: str, model: csplat.SplatModel) -> Iterator[tuple[str, Json]]:
 
 
 def keys_group(folder: Path) -> Iterator[tuple[str, Json]]:
-    """Yield the keys of what each command prints of small scenes."""
+    """Yield the keys of what each command prints of small scenes, and of files with what these lack."""
     views, small = folder / "cameras.json", folder / "small.ply"
     views.write_text(json.dumps(cameras(6.0, 40)), encoding="utf-8")
     file, other, box = folder / "small.csplat", folder / "other.csplat", "-1,-1,-1,1,1,1"
@@ -221,34 +223,44 @@ def keys_group(folder: Path) -> Iterator[tuple[str, Json]]:
     scenes_folder = folder / "scenes"
     scenes_folder.mkdir()
     (scenes_folder / "small.ply").write_bytes(small.read_bytes())
-    commands: dict[str, tuple[str | Path, ...]] = {
-        "encode": ("encode", small, file, "--preset", "fast"),
-        "encode --max-error": ("encode", small, other, "--max-error", "means=0.001"),
-        "encode --target-size": ("encode", small, folder / "target.csplat", "--target-size", "2500", "--no-prune",
-                                 "--cameras", views),
-        "decode": ("decode", file, folder / "decoded.ply"),
-        "info": ("info", file),
-        "info of a PLY": ("info", small),
-        "verify": ("verify", file),
-        "verify --source": ("verify", other, "--source", small),
-        "lint": ("lint", small),
-        "extract": ("extract", file, folder / "part.csplat", "--box", box),
-        "merge": ("merge", file, other, "-o", folder / "merged.csplat"),
-        "convert": ("convert", small, folder / "small.spz"),
-        "compare": ("compare", small, file, "--cameras", views),
-        "tradeoff": ("tradeoff", small, "--cameras", views, "--what", "presets"),
-        "render": ("render", small, folder / "renders", "--cameras", views),
-        "simplify": ("simplify", small, folder / "simple.ply", "--keep", "0.6", "--cameras", views),
-        "sensitivity": ("sensitivity", small, folder / "small.npz", "--cameras", views),
-        "train": ("train", images, ply, "--max-splats", "50", "--sh-degree", "1", "--iterations", "5"),
-        "finetune": ("finetune", ply, tuned, "--data", images, "--iterations", "2"),
-        "export-html": ("export-html", file, folder / "page.html"),
-        "export-element": ("export-element", folder / "element.js"),
-        "conformance decoder": ("conformance", "decoder", "--filter", "valid/quats*"),
-        "batch": ("batch", scenes_folder, folder / "batch", "--", "encode", "--preset", "fast"),
-    }  # fmt: skip
-    for name, words in commands.items():
-        yield name, sorted(keys(run(*words)))
+    defects, rich = folder / "defects.ply", VECTORS / "valid" / "rich.csplat"
+    lines = small.read_bytes().partition(b"end_header\n")
+    defects.write_bytes(lines[0] + lines[1] + b"\0\0\xc0\x7f" + lines[2][4:])  # NaN
+    commands: tuple[tuple[str, tuple[str | Path, ...]], ...] = (
+        ("encode", ("encode", small, file, "--preset", "fast")),
+        ("encode --max-error", ("encode", small, other, "--max-error", "means=0.001")),
+        ("encode --target-size", ("encode", small, folder / "target.csplat", "--target-size", "2500", "--no-prune",
+                                 "--cameras", views)),
+        ("encode --dry-run", ("encode", small, folder / "none.csplat", "--dry-run")),
+        ("decode", ("decode", file, folder / "decoded.ply")),
+        ("info", ("info", file)),
+        ("info", ("info", VECTORS / "valid" / "levels.csplat")),
+        ("info", ("info", rich)),
+        ("info of a PLY", ("info", small)),
+        ("verify", ("verify", file)),
+        ("verify", ("verify", VECTORS / "invalid" / "header_crc.csplat")),
+        ("verify --source", ("verify", other, "--source", small)),
+        ("lint", ("lint", defects)),
+        ("extract", ("extract", file, folder / "part.csplat", "--box", box)),
+        ("merge", ("merge", file, other, "-o", folder / "merged.csplat")),
+        ("convert", ("convert", small, folder / "small.spz")),
+        ("compare", ("compare", small, file, "--cameras", views)),
+        ("tradeoff", ("tradeoff", small, "--cameras", views, "--what", "presets")),
+        ("render", ("render", small, folder / "renders", "--cameras", views)),
+        ("simplify", ("simplify", small, folder / "simple.ply", "--keep", "0.6", "--cameras", views)),
+        ("sensitivity", ("sensitivity", small, folder / "small.npz", "--cameras", views)),
+        ("train", ("train", images, ply, "--max-splats", "50", "--sh-degree", "1", "--iterations", "5")),
+        ("train to a file", ("train", images, folder / "trained.csplat", "--max-splats", "50", "--iterations", "5")),
+        ("finetune", ("finetune", ply, tuned, "--data", images, "--iterations", "2")),
+        ("export-html", ("export-html", file, folder / "page.html")),
+        ("export-element", ("export-element", folder / "element.js")),
+        ("conformance decoder", ("conformance", "decoder", "--filter", "valid/quats*")),
+        ("batch", ("batch", scenes_folder, folder / "batch", "--", "encode", "--preset", "fast")),
+    )  # fmt: skip
+    found: dict[str, set[str]] = {}
+    for name, words in commands:
+        found.setdefault(name, set()).update(keys(run(*words)))
+    yield from ((name, sorted(those)) for name, those in found.items())
 
 
 GROUPS = {"bytes": bytes_group, "shared": shared_group, "keys": keys_group}

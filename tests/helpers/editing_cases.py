@@ -12,7 +12,7 @@ import csplat
 def extract(data, box):
     stream = io.BytesIO()
     part = csplat.extract(data, box, stream)
-    assert part.size == len(stream.getvalue())
+    assert part.size_bytes == len(stream.getvalue())
     return part, stream.getvalue()
 
 
@@ -31,5 +31,5 @@ STEPS = {
 def merge(*files, **named):
     stream = io.BytesIO()
     done = csplat.merge(files, stream, **named)
-    assert done.size == len(stream.getvalue())
+    assert done.size_bytes == len(stream.getvalue())
     return done, stream.getvalue()

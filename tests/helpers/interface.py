@@ -8,10 +8,10 @@ A test compares them with the code, so that no change of the interface goes unno
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import json
 import re
+import sys
 import textwrap
 from collections.abc import Iterable, Iterator
 from importlib import import_module
@@ -43,20 +43,25 @@ INTERNAL = {
     "DataSet": "inliers outliers read report trained_on",
     "EncodeOptions": "chosen kept_degree",
     "EncodeResult": "content rows with_notes with_search",
-    "FinetuneOptions": "has_calmed scaled",
+    "FinetuneOptions": "has_calmed learning_rate_factor scaled",
     "Scene": "changed empty has_doubles in_memory keep_open like loaded modified_ns numbered of reader with_progress",
     "SceneMetadata": "stated_up",
     "SimplifyOptions": "pruner views_and_size work",
     "SplatModel": "means_double",
     "Target": "as_json count is_rendered require size_bytes",
-    "TrainOptions": "active_degree is_half_size learning_rates prunings_left refine_end refines_after sh_every",
+    "TrainOptions": (
+        "active_degree growth_from is_half_size learning_rates prunings_left refine_begin refine_end refine_period "
+        "refines_after sh_every"
+    ),
     "TuningViews": "digest",
     "ViewSet": (
         "image_test_scorer image_validation_scorer images_of origin read_images test_background test_scorer "
         "validation_scorer"
     ),
 }
-INTERNAL["SplatFile"] = INTERNAL["Scene"] + " boxes pieces window"
+INTERNAL["SplatFile"] = INTERNAL["Scene"] + " pieces window"
+#: Keys of reports whose members are not promised.
+DIAGNOSTIC = ("chosen", "codings", "coders", "encoding", "entries", "log", "metadata", "options", "quantiles", "tried")
 HEADERS = ("codec/c/csplat.h", "codec/c/csplat_encode.h")
 WIDTH = 130  # characters per line
 
@@ -65,7 +70,7 @@ def page() -> str:
     """Return API.md with lists made from the code."""
     promise, _, _ = PAGE.read_text("utf-8").partition(BEGIN)
     parts = [
-        ("Python", "".join(_package(name) for name in PACKAGES)),
+        ("Python", "".join(_package(name) for name in PACKAGES) + _results()),
         ("JavaScript", "".join(_module(name, ROOT / path) for name, path in MODULES.items()) + _element()),
         ("C", "".join(_header(ROOT / path) for path in HEADERS)),
         ("Command line", "".join(_commands())),
@@ -88,14 +93,48 @@ def _package(name: str) -> str:
 def _python_entry(name: str, value: Any) -> str:
     """Return `name(parameters)` of a function, `name{members}` of a class, and the name of anything else."""
     if inspect.isclass(value):
-        members = {one for one in dir(value) if not one.startswith("_") and one not in dir(Exception)}
-        if dataclasses.is_dataclass(value):
-            members |= {field.name for field in dataclasses.fields(value)}
-        members -= set(INTERNAL.get(name, "").split())
-        return f"{name}{{{','.join(sorted(members))}}}" if members else name
+        members = sorted(_members(value))
+        return f"{name}{{{','.join(members)}}}" if members else name
     if inspect.isfunction(value):
         return f"{name}({','.join(inspect.signature(value).parameters)})"
     return name
+
+
+def _members(value: type) -> dict[str, str]:
+    """Return the promised members of a class, with the annotation of what each is or returns."""
+    annotations = {
+        name: str(text) for one in reversed(value.__mro__) for name, text in inspect.get_annotations(one).items()
+    }
+    members = {one for one in {*dir(value), *annotations} if not one.startswith("_") and one not in dir(Exception)}
+    found = {}
+    for one in members - set(INTERNAL.get(value.__name__, "").split()):
+        member = inspect.getattr_static(value, one, None)
+        code = getattr(member, "fget", None) or getattr(member, "func", None) or getattr(member, "__func__", member)
+        found[one] = annotations.get(one) or str(getattr(code, "__annotations__", {}).get("return", ""))
+    return found
+
+
+def _results() -> str:
+    """Return the classes that no package exports: results of its functions, members of its classes, and `FitStep`."""
+    packages = [import_module(package) for package in PACKAGES]
+    exported = {name: getattr(package, name) for package in packages for name in package.__all__}
+    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in PACKAGES]
+    classes = {name: value for one in modules for name, value in vars(one).items() if inspect.isclass(value)}
+    found = {"FitStep"}
+    for value in exported.values():
+        texts = (
+            _members(value).values()
+            if inspect.isclass(value)
+            else [getattr(value, "__annotations__", {}).get("return")]
+        )
+        known = classes | vars(sys.modules[getattr(value, "__module__", "csplat")])
+        for word in re.findall(r"\w+", " ".join(map(str, texts))):
+            found |= (
+                {word}
+                if inspect.isclass(known.get(word)) and known[word].__module__.partition(".")[0] in PACKAGES
+                else set()
+            )
+    return _list("results of these", (_python_entry(name, classes[name]) for name in sorted(found - exported.keys())))
 
 
 def _module(title: str, path: Path) -> str:
@@ -189,10 +228,17 @@ def _reports() -> Iterator[str]:
 
 
 def _folded(keys: list[tuple[str, ...]]) -> Iterator[str]:
-    """Yield keys with the same beginning as one entry, `a{b,c}`; what is below the second level is not listed."""
+    """Yield keys with the same beginning as one entry, `a{b,c{d}}`; neighbours with the same members as `a/b{c}`."""
+    entries = []
     for first, same in groupby(keys, lambda key: key[0]):
-        inner = sorted({key[1] for key in same if len(key) > 1})
-        yield f"{first}{{{','.join(inner)}}}" if inner else first
+        inner = [key[1:] for key in same if len(key) > 1] if first.removesuffix("[]") not in DIAGNOSTIC else []
+        entries.append((first, ",".join(_folded(inner))))
+    for members, group in groupby(entries, lambda entry: entry[1]):
+        names = [first for first, _ in group]
+        if members:
+            yield f"{'/'.join(names)}{{{members}}}"
+        else:
+            yield from names
 
 
 if __name__ == "__main__":

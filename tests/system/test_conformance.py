@@ -43,7 +43,7 @@ def copying(folder, name):
 @pytest.mark.slow
 def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     command = copying(tmp_path, "ordinary/one_splat")
-    one = ("--cmd", command, "--filter", "*/one_splat", "--keep", tmp_path / "kept", "--level")
+    one = ("--cmd", command, "--filter", "*/one_splat", "--save", tmp_path / "kept", "--level")
     reports = ("--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
     result = invoke(*one, 3, *reports)
     assert 0 == result.exit_code, result.output

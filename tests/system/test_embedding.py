@@ -567,7 +567,7 @@ def test_images_have_any_size_and_camera_and_the_canvas_stays_as_it_is(tab, site
     found = {given: page.evaluate(f"({code})({given})") for given in refusals}
     assert refusals == found
     late = "const made = view.toBlob().catch(({ code }) => code); view.src = '/other.csplat'; return made;"
-    assert "E_REPLACED" == page.evaluate(f"(() => {{ {late} }})()")
+    assert "E_SUPERSEDED" == page.evaluate(f"(() => {{ {late} }})()")
     assert_loads(tab, 90)
     assert "E_INPUT" == page.evaluate("document.createElement('csplat-view').toBlob().catch(({ code }) => code)")
 

@@ -233,7 +233,7 @@ def test_a_name_of_another_kind_is_refused_with_a_suggestion(tmp_path, monkeypat
         "render scene.ply out.ply --orbit 2": "csplat render scene.ply out.webp",
         "lint scene.ply --fix out.csplat": "csplat encode scene.ply out.csplat",
         "info scene.csplat --page out.png": "--page out.html",
-        "tradeoff scene.ply -o out.png": "-o out.html",
+        "tradeoff scene.ply --page out.png": "--page out.html",
         "encode scene.ply out.csplat --report out.csv": "--report out.json",
     }.items():
         assert f"did you mean `{meant}`? (E_INPUT)" in refused(*words.split()), words

@@ -154,7 +154,7 @@ def test_a_million_identical_splats_are_rendered_in_one_tile_and_refused_in_many
     assert file.stat().st_size < 6_000
     run("verify", file, "--source", ply)
     assert "MAX_INTERSECTIONS" in refused("render", file, "--orbit", 1, tmp_path / "pictures")
-    run("decode", file, tmp_path / "back.ply", "--max-splats", 999_999, status=1)
+    run("decode", file, tmp_path / "back.ply", "--limit-splats", 999_999, status=1)
     assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
 
 

@@ -60,7 +60,7 @@ def test_info_accounts_for_every_byte_and_prints_text(tmp_path, csplat_file):
     assert attributes + sum(described["overhead"].values()) == csplat_file.stat().st_size == described["size_bytes"]
     assert ["opacities", "scales", "quats", "means", "sh0", "sh1", "sh2"] == list(described["attributes"])
     assert ["geometry", "sh1", "sh2"] == list(described["layers"])
-    assert described["declared_errors"]["source_splats"] == 200
+    assert described["source"]["splats"] == 200
     assert described["options"]["asked"]["preset"] == "balanced"
     assert "splats       200, SH degree 2" in printed("info", csplat_file)
     data = csplat_file.read_bytes()

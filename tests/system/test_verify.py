@@ -17,10 +17,10 @@ pytestmark = pytest.mark.usefixtures("no_first_view")
 
 
 def test_decode_and_verify_refuse_more_splats_than_allowed(tmp_path, csplat_file):
-    assert "LIM-1" in invoke("verify", csplat_file, "--max-splats", 199).stdout
-    printed("verify", csplat_file, "--max-splats", 200)
-    assert "E_LIMIT" in refused("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 199)
-    printed("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 200)
+    assert "LIM-1" in invoke("verify", csplat_file, "--limit-splats", 199).stdout
+    printed("verify", csplat_file, "--limit-splats", 200)
+    assert "E_LIMIT" in refused("decode", csplat_file, tmp_path / "out.ply", "--limit-splats", 199)
+    printed("decode", csplat_file, tmp_path / "out.ply", "--limit-splats", 200)
 
 
 def test_verify_finds_damage(csplat_file):

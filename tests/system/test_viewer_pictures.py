@@ -194,7 +194,7 @@ def test_the_memory_is_bounded_wherever_the_camera_goes(remade, backend):
     row = make(means, sh0=rng.normal(0, 1, means.shape))
     data = encode(row, levels=FittedLevelBuilder(leaf_splats=400, root_splats=150))
     total = sum(tile.splat_count for tile in read_header(data).all_tiles)
-    engine = remade(f"{{ backend: '{backend}', splatBudget: 5200, pixelError: 0 }}")
+    engine = remade(f"{{ backend: '{backend}', maxSplats: 5200, pixelError: 0 }}")
     engine.open(data)
     pictures, here = [], []
     cameras = [look_at((x, 0, -20), (x, 0, 0), (0, -1, 0), intrinsics(64, 64, 30), 64, 64) for x in places[::3]]
@@ -399,7 +399,7 @@ def test_opening_again_replaces_the_scene(engine, sample, wide):
         "([one, two]) => { const first = open_(one); return open_(two).then(() => first); }",
         [engine.site.url("/scene.csplat"), engine.site.add("/second.csplat", data)],
     )
-    assert "E_REPLACED" == error["code"]
+    assert "E_SUPERSEDED" == error["code"]
     assert psnr(engine.picture(wide), reference(decode(data), wide)) >= GOOD
     assert len(second) == engine.stats()["splatCount"]
     assert [] == engine.page.evaluate("errors")

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
-    "VERSIONS",
     "Batch",
     "Comparison",
     "DataOptions",

@@ -369,7 +369,7 @@ def decode_file(
     *,
     sh_degree: int | None = None,
     absolute: bool = False,
-    max_splats: int | None = None,
+    limit_splats: int | None = None,
     overrides: MetadataOverrides | None = None,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
@@ -380,7 +380,7 @@ def decode_file(
         target: the PLY to write, or `-`; it is replaced without a check.
         sh_degree: drop the SH bands above.
         absolute: add the origin and write doubles.
-        max_splats: refuse a scene of more splats; `None`: no limit.
+        limit_splats: refuse a scene of more splats; `None`: no limit.
         overrides: overrides of the file's metadata for the PLY.
         progress: progress callback.
 
@@ -391,7 +391,7 @@ def decode_file(
         CsplatError: the file is not valid, or too large; no PLY is written then.
         OSError: a file cannot be read or written.
     """
-    limits = None if max_splats is None else Limits(splats=max_splats)
+    limits = None if limit_splats is None else Limits(splats=limit_splats)
     with mapped_csplat(source) as data, SplatFile.open(data, limits=limits) as decoded:
         # All bands are decoded, even if some are dropped, so that damage anywhere is found.
         scene = Filters(sh_degree=sh_degree).apply((overrides or MetadataOverrides()).apply_to_scene(decoded))

@@ -46,7 +46,7 @@ COMMANDS = {
     "lint": "lint scene.ply",
     "compare with LPIPS": "compare scene.ply scene.csplat --lpips auto",
     "compare": "compare scene.ply scene.csplat --pictures pictures",
-    "tradeoff": "tradeoff scene.ply -o tradeoff.html --what presets",
+    "tradeoff": "tradeoff scene.ply --page tradeoff.html --what presets",
     "sensitivity": "sensitivity scene.ply scene.npz --data set",
     "convert": "convert scene.ply convert.sog",
     "convert streamed": "convert scene.ply streamed/lod-meta.json",

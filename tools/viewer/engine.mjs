@@ -8,7 +8,7 @@
 //   await engine.open('scene.csplat');
 
 import { NO_CAMERA, completeSize, fitCamera, viewOf } from './camera_maths.mjs';
-import { EngineError, E_CONTEXT, E_INPUT, E_LIMIT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
+import { EngineError, E_CONTEXT, E_INPUT, E_LIMIT, E_SUPERSEDED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
 import { answer, sendable } from './fetch_port.mjs';
 import { FrameScheduler } from './frame_scheduler.mjs';
 import { SceneLoad } from './scene_load.mjs';
@@ -87,12 +87,12 @@ const [USUAL_PIXELS, SAVING_PIXELS] = [1, 2];
  * @param {boolean} sort whether the CPU sorts
  * @returns {import('../../codec/js/levels/tile_stream.mjs').Aims}
  */
-function aimsOf({ splatBudget, pixelError }, sort) {
+function aimsOf({ maxSplats, pixelError }, sort) {
   const device = /** @type {{deviceMemory?: number, connection?: {saveData?: boolean}}} */ (navigator);
   const { deviceMemory = SMALL_GB, connection } = device;
   const saves = connection?.saveData === true;
   const usual = (sort ? SORTED_SPLATS : UNSORTED_SPLATS) / (saves || deviceMemory < SMALL_GB ? 2 : 1);
-  return { budget: splatBudget ?? usual, pixels: pixelError ?? (saves ? SAVING_PIXELS : USUAL_PIXELS), around: !saves };
+  return { budget: maxSplats ?? usual, pixels: pixelError ?? (saves ? SAVING_PIXELS : USUAL_PIXELS), around: !saves };
 }
 
 /** Pixels of the largest picture that `toBlob` makes: 8192 × 8192, of 1 GiB in binary32. */
@@ -304,7 +304,7 @@ class SplatEngine {
     for (;;) {
       if (this.opening?.error) throw this.opening.error;
       if (scene && this.opening !== scene) {
-        throw new EngineError({ code: E_REPLACED, message: 'the scene was opened anew, or another one' });
+        throw new EngineError({ code: E_SUPERSEDED, message: 'the scene was opened anew, or another one' });
       }
       if (this.isSorted()) return;
       await new Promise((/** @type {(value: void) => void} */ resolve) => this.waiting.push(resolve));
@@ -347,7 +347,7 @@ class SplatEngine {
     const refuse = (/** @type {string} */ message, code = E_INPUT) => new EngineError({ code, message });
     const { opening, renderer } = this;
     const own = camera ?? this.camera;
-    if (this.frames.isClosed) throw refuse('the engine was closed before the picture was made', E_REPLACED);
+    if (this.frames.isClosed) throw refuse('the engine was closed before the picture was made', E_SUPERSEDED);
     if (opening === null || own === null) throw refuse('no picture can be made: no scene is open, or no camera is set');
     const size = completeSize({ width, height }, this.size);
     const shown = `${size.width} × ${size.height} pixels`;
@@ -413,7 +413,7 @@ class SplatEngine {
 
   /** @param {string} message */
   replaced(message) {
-    this.opening?.fail(new EngineError({ code: E_REPLACED, message }));
+    this.opening?.fail(new EngineError({ code: E_SUPERSEDED, message }));
   }
 
   /** @param {Request} request */

@@ -8,7 +8,7 @@ export const E_WEBGL2 = 'E_WEBGL2';
 /** The browser has lost the GPU; the engine continues by itself when it is restored. */
 export const E_CONTEXT = 'E_CONTEXT';
 /** Another scene was opened, or the engine closed, before everything was decoded. */
-export const E_REPLACED = 'E_REPLACED';
+export const E_SUPERSEDED = 'E_SUPERSEDED';
 /** The worker did not start, or failed. */
 export const E_WORKER = 'E_WORKER';
 /** The file cannot be read; the same code as the format's. */

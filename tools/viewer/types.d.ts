@@ -95,7 +95,7 @@ export interface Progress {
 
 /** An error as sent in messages; `fatal` if the scene is given up. */
 export interface ErrorReport {
-  /** A code of the format (E_CRC …) or of engine_error.mjs: E_WEBGL2, E_CONTEXT, E_REPLACED, E_WORKER. */
+  /** A code of the format (E_CRC …) or of engine_error.mjs: E_WEBGL2, E_CONTEXT, E_SUPERSEDED, E_WORKER. */
   code: string;
   message: string;
   /** Offset in the file and clause of the specification, if the file is invalid. */
@@ -157,7 +157,7 @@ export interface EngineOptions extends FetchOptions {
    * 6 million with WebGPU, 3 million with WebGL 2, half of that on small devices and for users who save data. Twice as many
    * are kept in memory.
    */
-  splatBudget?: number;
+  maxSplats?: number;
   /**
    * Error, in pixels, below which parts of a file with levels of detail are not refined further. Default: 1; 2 for users who save
    * data, and what is out of view is then not loaded.
@@ -194,7 +194,7 @@ export interface Engine {
    * Make an image of the scene, of any size, when everything that it requires is decoded; the canvas keeps its picture until
    * then. While the page is hidden, it waits for what a file with levels of detail still requires. `camera` is in pixels of the
    * image. Rejects with an EngineError: E_INPUT for invalid options, E_LIMIT for more
-   * pixels than possible, E_REPLACED if another scene is opened, E_CONTEXT if the GPU is lost, or that of the scene.
+   * pixels than possible, E_SUPERSEDED if another scene is opened, E_CONTEXT if the GPU is lost, or that of the scene.
    */
   toBlob(options?: PictureOptions): Promise<Blob>;
   /** Return the scene's file with other metadata. */

@@ -6,7 +6,7 @@ import { readCamera } from '../../codec/js/first_view.mjs';
 import { Controls } from './controls.mjs';
 import { completeSize, fitCamera } from './camera_maths.mjs';
 import { createEngine } from './engine.mjs';
-import { E_INPUT, E_REPLACED, EngineError } from './engine_error.mjs';
+import { E_INPUT, E_SUPERSEDED, EngineError } from './engine_error.mjs';
 import { readCameras } from './page.mjs';
 import { OrbitCamera } from './orbit_camera.mjs';
 import { CameraList, emptyPose } from './camera_list.mjs';
@@ -228,7 +228,7 @@ export class SceneViewer {
       if (mine === this.turn) hooks.shown(engine.stats);
     } catch (error) {
       const report = asReport(error);
-      if (mine === this.turn && report.code !== E_REPLACED) hooks.failed(report);
+      if (mine === this.turn && report.code !== E_SUPERSEDED) hooks.failed(report);
     } finally {
       if (mine === this.turn) this.isOpening = false;
     }

@@ -64,7 +64,7 @@ class Camera:
         """Position of the camera, [3], world coordinates."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), np.float64)
 
-    def to_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Return the camera as an entry of a camera file, a JSON object."""
         entry: dict[str, Any] = {
             "K": self.K.tolist(),

@@ -108,7 +108,7 @@ def load_cameras(
 
 def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
     """Write a camera file that `load_cameras` reads without loss."""
-    text = ",\n".join(json.dumps(camera.to_json(), allow_nan=False) for camera in cameras)
+    text = ",\n".join(json.dumps(camera.as_json(), allow_nan=False) for camera in cameras)
     Path(path).write_text(f"[\n{text}\n]\n", "utf-8")
 
 

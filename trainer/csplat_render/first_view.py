@@ -114,7 +114,7 @@ def view_entry(camera: Camera, source: str) -> dict[str, Any]:
         camera: the camera.
         source: `TRAINED`, `ESTIMATE` or `AUTHOR`.
     """
-    entry = {key: value for key, value in camera.to_json().items() if key != "image"}
+    entry = {key: value for key, value in camera.as_json().items() if key != "image"}
     entry["K"][0][2], entry["K"][1][2] = camera.W / 2, camera.H / 2  # engines have no other principal point
     for name in ("K", "viewmat"):
         entry[name] = [[_rounded(value) for value in row] for row in entry[name]]

@@ -141,9 +141,10 @@ class _Training:
         if not data.train:
             raise InputError("there are no images to train on")
         data.read()
+        options = replace(options, seed=context.seed if options.seed is None else options.seed)
         self._data, self._options, self._outputs, self._show = data, options, outputs, show
         self._scene = measure_extent(data.inliers)
-        self._fitter = Fitter(len(data.train), options.iterations, options.seed)
+        self._fitter = Fitter(len(data.train), options.iterations, options.seed or 0)
         self._log = self._fitter.log
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
@@ -369,7 +370,7 @@ class _Training:
             "options": asdict(self._options),
             "train_views": len(self._data.train),
             "test_views": len(self._data.test),
-            "splat_count": len(self._engine.parameters),
+            "splats": len(self._engine.parameters),
             "scene_extent": self._scene.extent,
             "peak_memory_bytes": peak_memory(),
             "metrics": metrics,

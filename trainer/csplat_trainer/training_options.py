@@ -42,7 +42,7 @@ class TrainOptions:
         max_splats: largest number of splats.
         sh_degree: SH degree of the finished scene, 0 to 4.
         iterations: training steps, one image each.
-        seed: seed of every random choice.
+        seed: seed of every random choice; `None`: that of the context.
         device: `cpu`, or `cuda`, a GPU with the gsplat package.
         engine: `native` (compiled, on a CPU), `torch` (slower on a CPU), or `auto`: native on a CPU, torch on a GPU.
         strategy: strategy of adding and removing splats: `mcmc`, `fixed`, `gradient` or `none`.
@@ -93,7 +93,7 @@ class TrainOptions:
     max_splats: int = 20_000
     sh_degree: int = 3
     iterations: int = 7_000
-    seed: int = 0
+    seed: int | None = None
     device: Device = "cpu"
     engine: EngineName = "auto"
     strategy: Strategy = "mcmc"
@@ -137,8 +137,8 @@ class TrainOptions:
         uses_torch(self.device, self.engine)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
-                raise InputError(f"{name} is {value}, expected {low:g} to {high:g}")
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
+                raise InputError(f"{name.rstrip('_')} is {value}, expected {low:g} to {high:g}")
         if self.lr_means_final > self.lr_means:
             raise InputError(f"lr_means_final is {self.lr_means_final:g}, expected at most lr_means, {self.lr_means:g}")
 

@@ -44,12 +44,12 @@ class ExtractResult:
     Attributes:
         tiles: indices of the extracted tiles in the source file, of all levels of detail.
         splat_count: number of splats extracted, of level 0.
-        size: size of the new file, bytes.
+        size_bytes: size of the new file.
     """
 
     tiles: tuple[int, ...]
     splat_count: int
-    size: int
+    size_bytes: int
 
 
 def extract(

@@ -64,7 +64,7 @@ class MergeResult:
     Attributes:
         splat_count: number of splats in the merged file.
         tile_count: number of its tiles.
-        size: size of the file in bytes.
+        size_bytes: size of the file.
         why: the reason why the scenes were encoded again; "" if tiles were copied.
         dropped: extra columns that were dropped because not all files have them; only if scenes were encoded again.
         notes: what was assumed of files that leave axes or unit open, and which metadata not all files share.
@@ -72,7 +72,7 @@ class MergeResult:
 
     splat_count: int
     tile_count: int
-    size: int
+    size_bytes: int
     why: str = ""
     dropped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

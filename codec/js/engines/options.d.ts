@@ -54,7 +54,7 @@ export interface SceneFacts<T = void> {
   /** Where a viewer starts: as the file has it, the same in every viewer; else an estimate from the boxes of its tiles. */
   view: SceneView;
   /** A sphere around most splats of the upright scene. */
-  bounds: { center: number[]; radius: number };
+  bounds: { centre: number[]; radius: number };
   /**
    * Resolves when the SH bands are loaded: at once, unless the load was progressive; with `levels`, when all that a camera
    * requires is drawn for the first time. Disposal ends it.

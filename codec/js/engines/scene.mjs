@@ -351,7 +351,7 @@ export class SplatScene {
     const centre = [0, 1, 2].map((axis) => quantile(this.sample.map((mean) => mean[axis]), 0.5)); // prettier-ignore
     const away = this.sample.map((mean) => Math.hypot(...mean.map((value, axis) => value - centre[axis])));
     return {
-      center: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)),
+      centre: turn.map((row) => row.reduce((sum, one, i) => sum + one * centre[i], 0)),
       radius: quantile(away, MOST),
     };
   }

@@ -155,8 +155,8 @@ async function geometryOf(scene) {
   }
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
-  const { center, radius } = facts.bounds;
-  const middle = new Vector3(...center).applyMatrix4(upright.clone().invert());
+  const { centre, radius } = facts.bounds;
+  const middle = new Vector3(...centre).applyMatrix4(upright.clone().invert());
   // From a middle inside of it, twice the radius of a sphere reaches all of the sphere.
   const sphere = new Sphere(middle, Math.min(SORTED * radius, 2 * (geometry.boundingSphere?.radius ?? Infinity)));
   const refine = (/** @type {GaussianSplat} */ splats) => {

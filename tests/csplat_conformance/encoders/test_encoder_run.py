@@ -215,7 +215,7 @@ def test_inputs_are_written_as_files_with_a_list(tmp_path):
 
 def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
     new = tmp_path / "new"
-    for words in (("--cmd", "x {ply} {out}"), ("--level", 2), ("--keep", "y"), ("--jobs", 2)):
+    for words in (("--cmd", "x {ply} {out}"), ("--level", 2), ("--save", "y"), ("--jobs", 2)):
         assert 2 == invoke("--write-inputs", new, *words).exit_code
         assert not new.exists()
     result = invoke("--write-inputs", new, "--filter", "ordinary/degree_*,broken/cut")

@@ -123,7 +123,7 @@ def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
         compare_models(scene, scene, [])
     virtual = comparison_cameras(scene)  # which only depend on the source
     assert [(640, 480)] * 8 == [(camera.W, camera.H) for camera in virtual]
-    again = comparison_cameras(with_facts(scene, cameras=[camera.to_json() for camera in virtual[:1]]))
+    again = comparison_cameras(with_facts(scene, cameras=[camera.as_json() for camera in virtual[:1]]))
     assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(virtual, again, strict=True))
 
 

@@ -76,7 +76,7 @@ def test_a_run_without_gain_ends_early_unless_files_are_too_large(monkeypatch):
     few = shell(3).select(slice(0, 40))  # coded so finely that tuning gains nothing
     fixed = fixed_by(EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"), few)
     views = split_views(renders_of(few, cameras(8), BLACK), BLACK, validation_count=3)
-    options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
+    options = replace(FEW, iterations=30, patience=2, lambda_=0.0).scaled(5.0)
     tuned = tune(fixed, views, options)
     assert tuned.log["converged"]
     assert 2 / 3 * 30 < tuned.log["steps"] < 30  # not before the learning rates are small
@@ -114,7 +114,7 @@ def test_an_ended_run_resumes_as_if_uninterrupted(tmp_path, share):
         run(on_step=interrupt, outputs=Outputs(file, 1e9))
     whole, rest = run(), run(outputs=Outputs(resume=file))
     assert written(fixed, whole.best_values) == written(fixed, rest.best_values)
-    for name in ("losses", "validations", "exposures", "byte_cost"):
+    for name in ("losses", "validations", "exposures", "lambda_"):
         assert whole.log[name] == rest.log[name]
 
 
@@ -122,15 +122,15 @@ def test_an_ended_run_resumes_as_if_uninterrupted(tmp_path, share):
 def test_lambda_is_controlled_to_meet_a_size():
     fixed = fixed_by(EncodeOptions(attribute_psnr=34.0))
     before = len(written(fixed, fixed.start()))
-    options, costs = replace(QUICK, byte_cost=4e-3), []
+    options, costs = replace(QUICK, lambda_=4e-3), []
     for share, steps in ((0.92, 120), (1.5, 60)):
         tuned = tune(fixed, views_of_source(), replace(options, iterations=steps), size_bytes=int(share * before))
         size = len(written(fixed, tuned.best_values))
         assert size <= share * before
         best = next(look for look in tuned.log["validations"] if look["iteration"] == tuned.log["best_iteration"])
         assert best["size_bytes"] == size
-        costs.append(tuned.log["byte_cost"])
-    assert costs[0] > options.byte_cost > costs[1]
+        costs.append(tuned.log["lambda_"])
+    assert costs[0] > options.lambda_ > costs[1]
 
 
 def test_the_rate_controller_adds_the_excess_of_a_file_to_the_loss_and_raises_lambda_in_time():
@@ -142,7 +142,7 @@ def test_the_rate_controller_adds_the_excess_of_a_file_to_the_loss_and_raises_la
         done = count / 20
         budget.excess(round(37_500 + bits / 8), bits)
         budget.update(bits, done, 1e-4)
-        bits *= 1.0 - 0.003 * (0.5 + 0.5 * math.cos(math.pi * done)) * math.log2(budget.byte_cost / 1e-4)
+        bits *= 1.0 - 0.003 * (0.5 + 0.5 * math.cos(math.pi * done)) * math.log2(budget.lambda_ / 1e-4)
     assert 0.0 == budget.excess(round(37_500 + bits / 8), bits)
     assert 0.98 * 100_000 < 37_500 + bits / 8
 
@@ -152,7 +152,7 @@ def test_a_damaged_checkpoint_and_those_of_other_runs_are_refused(tmp_path):
     tune(fixed, views, replace(QUICK, iterations=1), outputs=Outputs(file))
     lighter = replace(views, background=views.background + np.float32(0.5))
     for message, scene, seen, options, size_bytes in (
-        ("another byte_cost", fixed, views, replace(QUICK, byte_cost=0.5), None),
+        ("another lambda", fixed, views, replace(QUICK, lambda_=0.5), None),
         ("another target", fixed, views, QUICK, 10_000),
         ("other views", fixed, replace(views, train=views.train[1:]), QUICK, None),
         ("other views", fixed, lighter, QUICK, None),
@@ -179,9 +179,9 @@ def test_learning_rates_rise_and_fall_and_options_out_of_range_are_refused():
     assert (1 / 101, 0.01) == pytest.approx((shares[0], shares[-1]), rel=0.01)
     assert 90 < int(np.argmax(shares)) < 110
     assert 2.0 * options.lr_sh0 == options.scaled(2.0).lr_sh0
-    assert options.byte_cost == options.scaled(2.0).byte_cost
-    for name, wrong in {"iterations": 0, "lr_sh0": -1.0, "byte_cost": float("nan"), "loss": "l3"}.items():
-        with pytest.raises(InputError, match=name):
+    assert options.lambda_ == options.scaled(2.0).lambda_
+    for name, wrong in {"iterations": 0, "lr_sh0": -1.0, "lambda_": float("nan"), "loss": "l3"}.items():
+        with pytest.raises(InputError, match=name.rstrip("_")):
             FinetuneOptions(**{name: wrong})
 
 
@@ -230,8 +230,8 @@ def test_a_scene_is_tuned_to_its_own_renders_with_a_report_page(capture, tmp_pat
     facts = json.loads(report.read_text())
     assert (301, 301) == (facts["source_splats"], facts["splats"])
     assert (True, 2) == (facts["validation"]["held_out"], facts["validation"]["views"])
-    assert {"before tuning", "file"} == set(facts["scores"])
-    assert facts["scores"]["file"]["psnr"] > facts["scores"]["before tuning"]["psnr"] + 0.2
+    assert {"before_tuning", "file"} == set(facts["scores"])
+    assert facts["scores"]["file"]["psnr"] > facts["scores"]["before_tuning"]["psnr"] + 0.2
     pictures = re.findall("<figcaption>(.*?)</figcaption>", page.read_text())
     assert ["the source", "before tuning", "file"] * 3 == pictures[:9]
     compared = json.loads(call("compare", capture / "scene.ply", out, "--json").stdout)
@@ -363,7 +363,7 @@ def test_a_refused_run_writes_and_replaces_nothing(capture, tmp_path, monkeypatc
         (2, "scene.ply a.csplat", "--self --background white", "--background requires --cameras or --data"),
         (2, "scene.ply a.csplat", "--self --lambda 0 --target-size 1MB", "--lambda and --target-size: give one of"),
         (2, "scene.ply a.csplat", "--self --keep 0.5 --target-size 1MB", "--target-size and --keep: give one of"),
-        (2, "scene.ply a.csplat", "--self --lambda 2", "byte_cost is 2.0, expected 0 to 1"),
+        (2, "scene.ply a.csplat", "--self --lambda 2", "lambda is 2.0, expected 0 to 1"),
     ):
         result = invoke("finetune", *files.split(), *words.split(), *BRIEF)
         assert status == result.exit_code, words

@@ -58,7 +58,7 @@ def test_validation_views_are_training_views_by_default():
 @pytest.mark.slow
 def test_tuning_increases_the_psnr_of_test_images(tuned_file):
     scores = json.loads(tuned_file.report.read_text())["scores"]
-    source, before, after = (scores[name]["psnr"] for name in ("source", "before tuning", "file"))
+    source, before, after = (scores[name]["psnr"] for name in ("source", "before_tuning", "file"))
     assert after > before + 1.0
     assert source > before
     scene, path, data = tuned_file.source.ply, tuned_file.path, tuned_file.source.data

@@ -163,7 +163,7 @@ def encoder(
     jobs: _Jobs = None,
     timeout: _Timeout = None,
     junit: _Junit = None,
-    keep: Annotated[str | None, typer.Option(metavar="FOLDER", help="Keep inputs and results there.")] = None,
+    save: Annotated[str | None, typer.Option(metavar="FOLDER", help="Keep inputs and results there.")] = None,
     folder: Annotated[
         str | None, typer.Option("--write-inputs", metavar="FOLDER", help="Write the inputs, run nothing.")
     ] = None,
@@ -186,14 +186,14 @@ def encoder(
     Examples:
       csplat conformance encoder --cmd 'my-encoder {ply} {out}'
       csplat conformance encoder --cmd 'enc -s {ply} {out}' --min-psnr 28
-      csplat conformance encoder --cmd 'enc {ply} {out} {index}' --keep tried
+      csplat conformance encoder --cmd 'enc {ply} {out} {index}' --save tried
       csplat conformance encoder --write-inputs inputs
     """
     out = Output(force, report, as_json, quiet)
     shared.refuse_together(
         {"--write-inputs": folder},
         {
-            "--cmd": program, "--level": level, "--min-psnr": min_psnr, "--keep": keep, "--timeout": timeout,
+            "--cmd": program, "--level": level, "--min-psnr": min_psnr, "--save": save, "--timeout": timeout,
             "--jobs": jobs, "--junit": junit,
         },
     )  # fmt: skip
@@ -203,7 +203,7 @@ def encoder(
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
     levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4", last=4))
-    kept = _checked_folder(keep, force=out.force) if keep is not None else None
+    kept = _checked_folder(save, force=out.force) if save is not None else None
     render_score, reason = _render_scorer(levels)
     least = PSNR_MIN if min_psnr is None else min_psnr
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or ENCODER_SECONDS

@@ -21,7 +21,7 @@ def decode(
     up: shared.Up = None,
     sh_degree: shared.ShDegree = None,
     absolute: Annotated[bool, typer.Option("--absolute", help="Add the origin to positions, as doubles.")] = False,
-    max_splats: shared.MaxSplats = None,
+    limit_splats: shared.LimitSplats = None,
     force: shared.Force = False,
     report: shared.Report = None,
     as_json: shared.Json = False,
@@ -44,7 +44,7 @@ def decode(
     check_name(output, ".ply", "decode", source)
     with out.bar() as progress:
         count, degree = decode_file(
-            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, overrides=overrides,
+            source, output, sh_degree=sh_degree, absolute=absolute, limit_splats=limit_splats, overrides=overrides,
             progress=progress,
         )  # fmt: skip
     out.publish({"splats": count, "sh_degree": degree})

@@ -42,12 +42,12 @@ _DEFECTS = {
     "E_STORE": ("", "nothing was kept; try again"),
     "E_LIMIT": (
         "the scene is larger than is allowed here",
-        "`csplat decode` and `csplat verify` take scenes of any size",
+        "without --limit-splats, `csplat decode` and `csplat verify` take scenes of any size",
     ),
 }
 _LONG_TEXT = (
     "its metadata or cameras take more memory than is allowed here",
-    "in Python `csplat.decode(file, limits=csplat.decoder.Limits(json_bytes=...))` reads them",
+    "in Python `csplat.decode(file, limits=csplat.Limits(json_bytes=...))` reads them",
 )
 _LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, which loses a slash
 _OS_ADVICE = {

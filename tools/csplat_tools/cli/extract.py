@@ -54,7 +54,7 @@ def extract(
     which = "which it does not name" if axes == UNSPECIFIED else f"x, y, z = {axes}"
     out.remark(f"--box: along the axes of {source}, {which}")
     out.remark(
-        f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size)};"
+        f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size_bytes)};"
         f" read {format_bytes(read)} of {format_bytes(size)}, in {counted(requests, 'request')}"
     )
     if is_whole:
@@ -62,9 +62,10 @@ def extract(
     out.publish(
         {
             "splats": part.splat_count,
-            "tiles": list(part.tiles),
-            "axes": axes,
-            "bytes": part.size,
+            "tiles": len(part.tiles),
+            "tile_indices": list(part.tiles),
+            "coordinate_system": axes,
+            "size_bytes": part.size_bytes,
             "source_bytes": size,
             "bytes_read": read,
             "requests": requests,

@@ -31,8 +31,9 @@ def finetune(
     iterations: Annotated[
         int, typer.Option(metavar="N", min=1, show_default=False, help="Largest number of steps. Default: 1,000.")
     ] = 1_000,
-    byte_cost: Annotated[
-        float | None, typer.Option("--lambda", metavar="COST", help="Loss per bit and splat. Default: 1e-4.")
+    lambda_: Annotated[
+        float | None,
+        typer.Option("--lambda", metavar="COST", help="Loss per bit and splat. Default: 1e-4; --self: 2e-5."),
     ] = None,
     page: shared.Page = None,
     cameras: shared.HiddenCameras = None,
@@ -68,7 +69,7 @@ def finetune(
     by_psnr = {"--target-psnr": target_psnr}
     shared.refuse_together({**by_psnr, "--target-size": target_size, "--keep": keep})
     shared.refuse_together(by_psnr, {"--checkpoint": checkpoint, "--resume": resume})
-    shared.refuse_together({"--lambda": byte_cost}, {"--target-size": target_size, **by_psnr})
+    shared.refuse_together({"--lambda": lambda_}, {"--target-size": target_size, **by_psnr})
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
     target = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep)
     require_trainer(plots=page is not None)
@@ -77,8 +78,8 @@ def finetune(
     from csplat_trainer.training_options import Outputs
     from csplat_trainer.tuning.tuning_options import FinetuneOptions
 
-    cost = tuning.RATE_WEIGHT[own_renders] if byte_cost is None else byte_cost
-    options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
+    cost = tuning.RATE_WEIGHT[own_renders] if lambda_ is None else lambda_
+    options = shared.checked(FinetuneOptions, iterations=iterations, lambda_=cost).scaled(
         tuning.LEARNING_FACTOR[own_renders]
     )
     encoding = EncodeOptions(preset, shape_codebook_size=tuning.SHAPE_ENTRIES)

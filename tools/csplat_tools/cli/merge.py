@@ -58,12 +58,13 @@ def merge(
     if done.dropped:
         out.remark(f"not all files have them, left out: {', '.join(done.dropped)}")
     how = "coded again" if done.why else "copied"
-    out.remark(f"{done.splat_count:,} splats in {counted(done.tile_count, 'tile')}, {how}: {format_bytes(done.size)}")
+    size = format_bytes(done.size_bytes)
+    out.remark(f"{done.splat_count:,} splats in {counted(done.tile_count, 'tile')}, {how}: {size}")
     out.publish(
         {
             "splats": done.splat_count,
             "tiles": done.tile_count,
-            "bytes": done.size,
+            "size_bytes": done.size_bytes,
             "copied": not done.why,
             "why": done.why,
             "dropped": list(done.dropped),

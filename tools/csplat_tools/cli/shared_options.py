@@ -87,7 +87,7 @@ ShDegree = Annotated[
 _level = typer.Option("--level", metavar="K|N", help="Level, or most splats: 1, 500k. Default: 0.")
 Level = Annotated[str | None, _level]
 HiddenLevel = Annotated[str | None, hidden(_level)]
-MaxSplats = Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse larger scenes. Default: no limit.")]
+LimitSplats = Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse larger scenes. Default: no limit.")]
 SourceIndexOutput = Annotated[
     str | None,
     typer.Option("--source-index", metavar="FILE.npy", hidden=True, help="Write the source index of each splat."),
@@ -136,7 +136,7 @@ Resume = Annotated[
     str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
 ]
 HiddenMemory = Annotated[
-    str | None, typer.Option("--memory", metavar="BYTES", hidden=True, help="E.g. 8GB. Default: the free memory.")
+    str | None, typer.Option("--memory", metavar="BYTES", hidden=True, help="E.g. 8GB. Default: half of what is free.")
 ]
 _scheduler = typer.Option("--scheduler", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")
 Scheduler = Annotated[str | None, _scheduler]

@@ -17,9 +17,7 @@ from csplat_tools.optional_packages import require_plots, require_renderer
 
 def tradeoff(
     source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
-    page: Annotated[
-        str | None, typer.Option("--output", "-o", metavar="PAGE.html", help="Write an HTML report.")
-    ] = None,
+    page: Annotated[str | None, typer.Option(metavar="PAGE.html", help="Write an HTML report.")] = None,
     what: Annotated[str | None, typer.Option(metavar="GROUPS", help="Settings, see above. Default: all.")] = None,
     preset: shared.Preset = "balanced",
     cameras: shared.Cameras = None,
@@ -39,11 +37,11 @@ def tradeoff(
       simplify=0.7:0.5    fractions of the splats; slow
     A group without `=` has default values. PSNR is measured against the
     source's renders, as by `csplat compare`, and against the images of --data.
-    -o and --data require the render extra.
+    --page and --data require the render extra.
 
     Examples:
       csplat tradeoff scene.ply
-      csplat tradeoff scene.ply -o report.html --report report.json
+      csplat tradeoff scene.ply --page report.html --report report.json
       csplat tradeoff scene.ply --what presets,precision=36:44:52
       csplat tradeoff scene.ply --data capture --what presets,targets=30:32
     """
@@ -55,7 +53,7 @@ def tradeoff(
     out, views = Output(force, report, as_json, quiet), shared.ViewOptions(cameras, data)
     grid = shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
     searches = [(setting.options, setting.target) for setting in grid if setting.target is not None]
-    out.check(inputs=(source, *views.inputs), named={"-o": page})
+    out.check(inputs=(source, *views.inputs), named={"--page": page})
     require_renderer()
     if page is not None:
         require_plots()

@@ -62,7 +62,7 @@ def train(
     ] = _DEFAULT.background,
     seed: Annotated[
         int, typer.Option(metavar="N", min=0, hidden=True, show_default=False, help="Random seed. Default: 0.")
-    ] = _DEFAULT.seed,
+    ] = 0,
     checkpoint: shared.Checkpoint = None,
     resume: shared.Resume = None,
     force: shared.Force = False,

@@ -23,7 +23,7 @@ def verify(
         str | None, typer.Option(metavar="IN.ply", help="Source: verify the declared errors, too.")
     ] = None,
     source_index: shared.SourceIndexInput = None,
-    max_splats: shared.MaxSplats = None,
+    limit_splats: shared.LimitSplats = None,
     force: shared.Force = False,
     report: shared.Report = None,
     as_json: shared.Json = False,
@@ -48,7 +48,7 @@ def verify(
     try:
         with out.bar() as progress:
             context = Context(progress=progress)
-            verified = verify_file(path, source, source_index, max_splats=max_splats, context=context)
+            verified = verify_file(path, source, source_index, limit_splats=limit_splats, context=context)
     except CsplatError as error:
         out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise

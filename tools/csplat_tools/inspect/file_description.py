@@ -8,6 +8,7 @@ memory-mapped file of any size is described at once. Every length is checked aga
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -200,7 +201,8 @@ class FileDescription:
         metadata, up = self.metadata, self.metadata.up
         largest = {"max_scale": finite_or_none(max(tile.max_scale for tile in tiles))} if tiles else {}
         return {
-            "format": f"csplat {header.version[0]}.{header.version[1]}",
+            "format": "csplat",
+            "format_version": f"{header.version[0]}.{header.version[1]}",
             "profile": header.profile,
             "resource_level": header.resource_level,
             "size_bytes": header.file_size,
@@ -227,15 +229,16 @@ class FileDescription:
             "overhead": dict(self.overhead),
             "codebooks": [asdict(codebook) for codebook in self.codebooks],
             "extra_columns": [asdict(extra) for extra in header.extras],
-            "tiles": {"count": len(tiles), **{name: asdict(span) for name, span in self.spans.items()}, **largest},
+            "tiles": len(tiles),
+            "tile_ranges": {**{name: asdict(span) for name, span in self.spans.items()}, **largest},
             "chunks": [
                 {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
                 for chunk in header.directory
             ],
             "cameras": None if metadata.cameras is None else len(metadata.cameras),
             "options": self.options,
-            "metadata": dict(metadata.entries) or None,
-            "declared_errors": None if self.declared_bounds is None else _bounds_as_json(self.declared_bounds),
+            "metadata": dict(metadata.entries),
+            **_bounds_as_json(self.declared_bounds),
         }
 
 
@@ -283,7 +286,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "size_bytes": size,
             "bytes_per_splat": per_splat,
             "splats": count,
-            "levels": list(scene.levels),
+            "levels": [{"level": level, "splats": splats} for level, splats in enumerate(scene.levels)],
             "sh_degree": scene.sh_degree,
             "coordinate_system": metadata.coordinate_system,
             "file_axes": scene.file_axes or metadata.coordinate_system,
@@ -291,7 +294,10 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "unit_metres": metadata.unit_metres,
             "antialiased": metadata.antialiased,
             "flat": metadata.flat,
-            "extra": {name: describe_dtype(dtype) for name, dtype in scene.extra.items()},
+            "extra_columns": [
+                {"name": name, "dtype": dtype.base.str, "components": math.prod(dtype.shape)}
+                for name, dtype in scene.extra.items()
+            ],
             "metadata": dict(metadata.entries),
             "findings": findings_as_json(scene.findings),
         }
@@ -479,7 +485,7 @@ def _summarise_layers(header: SceneHeader) -> dict[str, LayerSummary]:
         if chunk.type == _spec.CHUNK_CODEBOOK:
             codebook_bytes[chunk.layer] += chunk.size
     names = _spec.LAYER_NAMES | {
-        id_: f"extra {column.name}" for id_, column in enumerate(header.extras, EXTRA_LAYERS[0])
+        id_: f"extra:{column.name}" for id_, column in enumerate(header.extras, EXTRA_LAYERS[0])
     }
     sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
     return {
@@ -537,14 +543,18 @@ def _summarise_codebook(header: SceneHeader, record: _spec.CodebookRecord) -> Co
     )
 
 
-def _bounds_as_json(bounds: DeclaredBounds) -> dict[str, Any]:
-    """Return the declared bounds as JSON-compatible values."""
+def _bounds_as_json(bounds: DeclaredBounds | None) -> dict[str, Any]:
+    """Return the declared bounds, and what they say of the source, as JSON-compatible values."""
+    if bounds is None:
+        return {"declared_errors": None, "source": None}
     return {
-        "source_splats": bounds.source_count,
-        "pruned_splats": bounds.pruned_count,
-        "source_sh_degree": bounds.source_sh_degree,
-        "refitted": bounds.refitted,
-        "errors": {record.measure: {"max": record.max, "rms": record.rms} for record in bounds.records},
+        "declared_errors": {record.measure: {"max": record.max, "rms": record.rms} for record in bounds.records},
+        "source": {
+            "splats": bounds.source_count,
+            "pruned_splats": bounds.pruned_count,
+            "sh_degree": bounds.source_sh_degree,
+            "refitted": bounds.refitted,
+        },
     }
 
 

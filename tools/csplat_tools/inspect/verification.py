@@ -72,7 +72,7 @@ def verify_file(
     source: str | None = None,
     source_index: str | None = None,
     *,
-    max_splats: int | None = None,
+    limit_splats: int | None = None,
     context: Context = DEFAULT_CONTEXT,
 ) -> Verification:
     """Find every violation in a file; if there is none and a source is given, verify its declared bounds.
@@ -81,7 +81,7 @@ def verify_file(
         path: the file, or `-`.
         source: its source.
         source_index: the .npy file that the encoder wrote.
-        max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
+        limit_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
         context: threads, progress, and memory, by default all of it without an index; larger scenes are verified tile
             by tile, which requires a source index.
 
@@ -91,7 +91,7 @@ def verify_file(
     """
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
     with mapped_csplat(path) as data:
-        validation = validate(data, splats_max=max_splats, progress=context.progress)
+        validation = validate(data, splats_max=limit_splats, progress=context.progress)
         if source is None or not validation.conforms:
             return Verification(validation, None)
         return Verification(validation, _verify_bounds(data, source, rows, context))

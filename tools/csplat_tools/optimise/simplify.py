@@ -40,7 +40,8 @@ class SimplifyOptions:
 
     Attributes:
         refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
-        effort: amount of work, 1 to 5. Steps of refits halve with each level below 3, and double with every two above.
+        effort: amount of work, 1 to 5; `None`: that of the target. Steps of refits halve with each level below 3, and
+            double with every two above.
         view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
         views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
         background: red, green, blue behind virtual views; given views have their own.
@@ -50,13 +51,13 @@ class SimplifyOptions:
     """
 
     refit: bool = True
-    effort: int = Target.effort
+    effort: int | None = None
     view_size: tuple[int, int] | None = None
     views: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.effort <= 5:
+        if self.effort is not None and not 1 <= self.effort <= 5:
             raise InputError(f"effort is {self.effort}, expected 1 to 5")
         if self.views is not None and self.views < 1:
             raise InputError(f"views is {self.views}, expected at least 1")
@@ -71,7 +72,7 @@ class SimplifyOptions:
     @property
     def work(self) -> float:
         """The amount of work relative to the default effort."""
-        octaves = self.effort - Target.effort
+        octaves = 0 if self.effort is None else self.effort - Target.effort
         return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
 
     def pruner(
@@ -120,7 +121,7 @@ def simplify(
         target: a fraction to keep, a PSNR, or a drop of PSNR; the fewest splats that meet it are kept.
         views: the kept splats are fitted to training views; validation views determine how many may be pruned. `None`:
             virtual views.
-        options: number and size of views, instead of the target's effort.
+        options: number and size of views.
         context: threads and progress; seed of the virtual views, and of the order in which views are used.
 
     Returns:
@@ -144,7 +145,8 @@ def simplify(
     require_renderer()
     target.require("simplify", "keep", "psnr", "max_psnr_drop")
     source, start = load_scene(scene).model(), time.perf_counter()
-    options = options or SimplifyOptions(effort=target.effort)
+    options = options or SimplifyOptions()
+    options = replace(options, effort=target.effort if options.effort is None else options.effort)
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
     if target.max_psnr_drop is not None and (views is None or not views.images):

@@ -234,7 +234,7 @@ def page_parameters(
     """
     wishes = {}
     if camera is not None:
-        entries = [view.to_json() for view in load_cameras(camera, report, origin)]
+        entries = [view.as_json() for view in load_cameras(camera, report, origin)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
     if overrides.coordinate_system is not None:
         wishes["axes"] = overrides.coordinate_system

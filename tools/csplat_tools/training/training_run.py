@@ -215,7 +215,7 @@ def explain_size(result: Mapping[str, Any], target: Target | None) -> list[str]:
     training, file = result["training"], result["file"]
     if target is None or target.size_bytes is None or file["size_bytes"] >= _MUCH_SMALLER * target.size_bytes:
         return []
-    count, most, steps = training["splat_count"], training["options"]["max_splats"], training["options"]["iterations"]
+    count, most, steps = training["splats"], training["options"]["max_splats"], training["options"]["iterations"]
     text = f"{format_bytes(target.size_bytes)} do not bind: {format_bytes(file['size_bytes'])} hold"
     if count >= _kept_for(target.size_bytes):
         return [f"{text} the {file['splats']:,} splats; more need a larger --max-splats than {most:,}"]
@@ -224,19 +224,19 @@ def explain_size(result: Mapping[str, Any], target: Target | None) -> list[str]:
     return [f"{text} the {count:,} splats to which {counted(steps, 'step')} grew the scene; more --iterations add some"]
 
 
-def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
+def tuning_after(training: TrainOptions, lambda_: float | None = None) -> FinetuneOptions:
     """Return the options of the tuning after a training: the longer the training, the more and smaller steps.
 
     A sixth of the training's steps, but at least the usual number, or a quarter of the training's if that is less.
 
     Args:
         training: options of the training.
-        byte_cost: lambda, loss per bit and splat; `None`: the default.
+        lambda_: lambda, loss per bit and splat; `None`: the default.
 
     Raises:
         InputError: lambda is out of range.
     """
-    usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
+    usual = FinetuneOptions(seed=training.seed, lambda_=RATE_WEIGHT[False] if lambda_ is None else lambda_)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
     least = min(usual.iterations, max(1, round(_BRIEF_TUNING * training.iterations)))
     steps = max(least, round(_TUNING * training.iterations))
@@ -332,7 +332,7 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
 
 def _summarise_training(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
     """Return a line on a training: splats, steps, seconds, and scores on test images if there are any."""
-    text = f"{counted(log['splat_count'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
+    text = f"{counted(log['splats'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
     if metrics is None:
         return text + "; no test images"
     text += f"; {counted(metrics['views'], 'test image')}: PSNR {metrics['psnr']:.2f} dB pooled,"

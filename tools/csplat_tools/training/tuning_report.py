@@ -187,8 +187,14 @@ def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[s
         return "-" if value is None else f"{value:.{digits}f}"
 
     return [
-        (name, *(cell(values[score], digits) for score, digits in SCORES.items())) for name, values in scores.items()
+        (_caption(name), *(cell(values[score], digits) for score, digits in SCORES.items()))
+        for name, values in scores.items()
     ]
+
+
+def _caption(name: str) -> str:
+    """Return the name of a model, which is a key of JSON, for people."""
+    return name.replace("_", " ")
 
 
 _SHOWN_VIEWS = 3  # number of test views on the page
@@ -216,7 +222,7 @@ def show_views(
 
     Args:
         source: the scene, whose renders are the reference if the views have no images.
-        models: models to render, by caption.
+        models: models to render, by name.
         views: the views.
         context: threads and progress.
     """
@@ -233,7 +239,7 @@ def show_views(
 
         def add(at: int, image: NDArray[np.float32], render: NDArray[np.float32], name: str = name) -> None:
             rows[at].setdefault(reference, to_uint8(image))
-            rows[at][name] = to_uint8(render)
+            rows[at][_caption(name)] = to_uint8(render)
 
         scorer.scores(model, ssim=False, on_view=add)
     names = [camera.image or f"view {place}" for place, camera in zip(places, scorer.cameras, strict=True)]
@@ -281,7 +287,7 @@ def _summarise(training: Mapping[str, Any] | None, file: Mapping[str, Any] | Non
         words += [counted(file["splats"], "splat"), format_bytes(file["size_bytes"])]
         words.append(f"{file['ratio']:.1f} times smaller than the PLY")
     elif training is not None:
-        words.append(counted(training["splat_count"], "splat"))
+        words.append(counted(training["splats"], "splat"))
     seconds = training["seconds"] if training else 0.0
     if file is not None:
         tuning = file["seconds"]["tuning"]

@@ -168,7 +168,7 @@ def run_finetuning(
         if source_index is not None:
             write_array(source_index, made.result.source_index)
         with timer.stage("judging"):
-            models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
+            models = {"source": source, "before_tuning": decode(made.plain.data), "file": made.decoded}
             scores = score_models(source, models, views, lpips, context, known=known)
         shown = [] if page is None else show_views(source, models, views, context)
     report = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.pruning)

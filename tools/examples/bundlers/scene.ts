@@ -21,7 +21,7 @@ export async function show(canvas: HTMLCanvasElement, url: string, signal?: Abor
   const splats = new GaussianSplat(geometry);
   splats.applyMatrix4(upright);
   refine(splats);
-  const [x, y, z] = bounds.center;
+  const [x, y, z] = bounds.centre;
   const camera = new PerspectiveCamera(45, canvas.clientWidth / canvas.clientHeight, 0.01, 1000);
   camera.position.set(x, y + bounds.radius, z + 3 * bounds.radius);
   camera.lookAt(x, y, z);

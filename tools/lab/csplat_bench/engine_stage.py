@@ -162,7 +162,7 @@ def chosen_view(scene: Scene) -> tuple[SplatModel, Camera]:
         cameras,
         key=lambda camera: psnr(screen_render(model, camera), screen_render(model, camera, sh_degree=0)),
     )
-    return replace(model, metadata=replace(model.metadata, cameras=[chosen.to_json()])), chosen
+    return replace(model, metadata=replace(model.metadata, cameras=[chosen.as_json()])), chosen
 
 
 def placed_in(form: Format, model: SplatModel) -> tuple[SplatModel, Camera]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ def tune(
         fixed: the encoder's decisions.
         views: training and validation views.
         options: options of the tuning.
-        size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `byte_cost`.
+        size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `lambda_`.
         outputs: checkpoints; a run resumes from a checkpoint of the same fixed quantisation.
         on_step: called with the progress of the tuning, every `log_every` steps.
         context: threads and progress.
@@ -119,17 +119,18 @@ class _Tuning:
         context: Context,
         size_bytes: int | None,
     ) -> None:
+        options = replace(options, seed=context.seed if options.seed is None else options.seed)
         self._views, self._options, self._outputs, self._show = views, options, outputs, show
         self._fixed, self._context = fixed, context
         self._engine = self._make_engine(None)
         log_size = np.median(np.median(fixed.encode_plan.model.scales, axis=1))
         self._typical_size = float(np.exp(np.clip(log_size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)))
-        self._fitter = Fitter(len(views.train), options.iterations, options.seed)
+        self._fitter = Fitter(len(views.train), options.iterations, options.seed or 0)
         self._log = self._fitter.log
         self._log |= {"validations": [], "views": views.digest}
         self._view_numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
-        self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
+        self._controller = None if size_bytes is None else RateController(size_bytes, options.lambda_)
 
     def resume(self, path: str | Path) -> None:
         """Continue from a checkpoint.
@@ -176,10 +177,10 @@ class _Tuning:
 
     def step(self, view: int) -> PendingLoss:
         fitter, options = self._fitter, self._options
-        if self._byte_cost > 0.0 and (fitter.rate is None or fitter.is_due(COUNT_EVERY)):
-            fitter.rate = self._engine.count(self._byte_cost)
+        if self._lambda > 0.0 and (fitter.rate is None or fitter.is_due(COUNT_EVERY)):
+            fitter.rate = self._engine.count(self._lambda)
             if self._controller is not None:
-                self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
+                self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.lambda_)
         gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
         value = self._engine.step(self._views.train[view], gain, self._learning_rates(), fitter.rate)
         if fitter.iteration == 1 and not math.isfinite(value.read().loss):  # the loss of the initial values
@@ -196,9 +197,9 @@ class _Tuning:
             self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
 
     @property
-    def _byte_cost(self) -> float:
+    def _lambda(self) -> float:
         """Current lambda, loss per bit and splat."""
-        return self._options.byte_cost if self._controller is None else self._controller.byte_cost
+        return self._options.lambda_ if self._controller is None else self._controller.lambda_
 
     def _learning_rates(self) -> dict[str, float]:
         """Return the learning rates of the current step by group; means move in units of the typical splat's size."""
@@ -252,7 +253,7 @@ class _Tuning:
             loss += value.loss / len(self._views.validation)
             squared_error += view_error
             value_count += 3 * (view.camera.W * view.camera.H if view.mask is None else int(view.mask.sum()))
-        costs = self._engine.count(self._options.byte_cost)
+        costs = self._engine.count(self._options.lambda_)
         psnr = psnr_of_mse(squared_error / value_count)
         size_bytes = len(self._fixed.encode(values).write().data)
         shrinks = False  # True if the file is too large, and lambda can still rise
@@ -299,7 +300,7 @@ class _Tuning:
             "held_out": self._views.is_held_out,
             "steps": self._fitter.iteration,
             "converged": self._fitter.has_ended,
-            "byte_cost": self._byte_cost,
+            "lambda_": self._lambda,
             "start_psnr": self._log["validations"][0]["psnr"],
             "best_psnr": self._best.psnr,
             "best_iteration": self._best.iteration,
@@ -327,24 +328,24 @@ class RateController:
 
     Attributes:
         size_bytes: largest size of the file.
-        byte_cost: current lambda, loss per bit and splat.
+        lambda_: current lambda, loss per bit and splat.
         first_bits: bits of the integers at the start of the run; 0: not known yet.
         goal_bits: bits of the integers of a file of that size, estimated from the last file.
     """
 
     size_bytes: int
-    byte_cost: float
+    lambda_: float
     first_bits: float = 0.0
     goal_bits: float = 0.0
 
     def __post_init__(self) -> None:
         # A lambda of 0 would remain 0 under any factor.
-        self.byte_cost = min(max(self.byte_cost, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1])
+        self.lambda_ = min(max(self.lambda_, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1])
 
     @property
     def is_exhausted(self) -> bool:
         """True if lambda cannot be raised further."""
-        return self.byte_cost >= _WEIGHT_RANGE[1]
+        return self.lambda_ >= _WEIGHT_RANGE[1]
 
     @classmethod
     def of(cls, stored: Any) -> RateController | None:
@@ -378,7 +379,7 @@ class RateController:
         planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_FRACTION)
         by = min(max(_RATE_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_LOG_CHANGE_MAX), _LOG_CHANGE_MAX)
         least = max(_MIN_WEIGHT_FRACTION * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
-        self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
+        self.lambda_ = min(max(self.lambda_ * math.exp(by), least), _WEIGHT_RANGE[1])
 
 
 _FREE_VALUES = tuple(field.name for field in fields(FreeValues))

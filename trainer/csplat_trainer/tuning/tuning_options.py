@@ -16,7 +16,7 @@ class FinetuneOptions:
 
     Attributes:
         iterations: steps at most, one image each.
-        seed: seed of the order of the images.
+        seed: seed of the order of the images; `None`: that of the context.
         device, engine: as in `TrainOptions`.
         loss: `inria`, `study` or `l1`, as in `TrainOptions`.
         lr_means: learning rate of the means, as a fraction of the median of the splats' middle standard deviation.
@@ -27,7 +27,7 @@ class FinetuneOptions:
         lr_shN: learning rate of the higher SH coefficients.
         lr_entries: learning rate of the codebook's entries.
         lr_exposure: as in `TrainOptions`; 0: gains and biases of images are not trained.
-        byte_cost: lambda, loss per bit and splat; 0: the size of the file has no influence.
+        lambda_: lambda, loss per bit and splat; 0: the size of the file has no influence.
         warm_up: steps of small learning rates, in which Adam estimates the magnitude of gradients.
         decay: final fraction of the learning rates. It is tiny, since otherwise values alternate between two integers.
         validate_every: steps between evaluations on the validation views.
@@ -40,7 +40,7 @@ class FinetuneOptions:
     """
 
     iterations: int = 1_000
-    seed: int = 0
+    seed: int | None = None
     device: Device = "cpu"
     engine: EngineName = "auto"
     loss: Loss = "inria"
@@ -52,7 +52,7 @@ class FinetuneOptions:
     lr_shN: float = 2e-3
     lr_entries: float = 4e-3
     lr_exposure: float = 0.0
-    byte_cost: float = 1e-4
+    lambda_: float = 1e-4
     warm_up: int = 100
     decay: float = 5e-4
     validate_every: int = 100
@@ -66,8 +66,8 @@ class FinetuneOptions:
         uses_torch(self.device, self.engine)
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
-                raise InputError(f"{name} is {value}, expected {low:g} to {high:g}")
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
+                raise InputError(f"{name.rstrip('_')} is {value}, expected {low:g} to {high:g}")
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Return the factor of the learning rates at a step."""
@@ -98,7 +98,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lr_shN": (0, 1),
     "lr_entries": (0, 1),
     "lr_exposure": (0, 1),
-    "byte_cost": (0, 1),
+    "lambda_": (0, 1),
     "warm_up": (0, 10**7),
     "decay": (0, 1),
     "validate_every": (1, 10**7),

@@ -141,7 +141,7 @@ def _tuned(ply: Path, data: DataSet, options: TrainOptions, megabytes: float) ->
         encoding = EncodeOptions("small", shape_codebook_size=SHAPE_ENTRIES)
         views = find_view_set(trained.model, data=data, validation_count=0)
         tuned = choose_and_finetune(
-            trained.model, views, encoding, tuning_after(options), target, context=Context(seed=options.seed)
+            trained.model, views, encoding, tuning_after(options), target, context=Context(seed=options.seed or 0)
         )
         seconds = {"pruning": round(pruning, 1), **tuned.seconds}
         write_json(path.with_suffix(".json"), {"training": training, "seconds": seconds, "machine": _machine(options)})

@@ -127,7 +127,7 @@ def _train(data_set: _Set, case: Case) -> None:
     ply, start = data_set.path_of(case.name, ".ply"), time.perf_counter()
     report = alone(run_training, data_set.options, str(ply), TrainOptions(**case["train"]), files, quiet=True)
     row = {
-        "seconds": time.perf_counter() - start, "splats": report["splat_count"], "steps": len(report["losses"]),
+        "seconds": time.perf_counter() - start, "splats": report["splats"], "steps": len(report["losses"]),
         "peak_memory_bytes": report["peak_memory_bytes"],
     }  # fmt: skip
     data_set.path_of(case.name, ".json").write_text(json.dumps(row))
@@ -188,7 +188,7 @@ def _describe(report: Mapping[str, Any], seconds: float, file: Path) -> dict[str
         "steps": report.get("steps"), "size_bytes": file.stat().st_size,
         "peak_memory_bytes": report.get("peak_memory_bytes"), "attribute_bytes": report.get("bytes_by_attribute"),
         "size_bytes_before_tuning": report.get("size_bytes_before_tuning"),
-        "before_tuning": report.get("scores", {}).get("before tuning"),
+        "before_tuning": report.get("scores", {}).get("before_tuning"),
     }  # fmt: skip
 
 
