@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 from dataclasses import dataclass
 
 from csplat.errors import InputError
@@ -12,6 +13,7 @@ from csplat.sizes import Size, parse_size
 from csplat.system import core_count, default_memory_bytes
 from csplat.types import Progress, null_progress
 
+_SCHEDULER = re.compile(r"[a-z]+://[^/\s]+:\d+")
 _LEAST = {"threads": 1, "workers": 1, "seed": 0}  # smallest value of each number; NumPy takes no negative seeds
 
 
@@ -51,6 +53,8 @@ class Context:
             if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
                 raise InputError(f"{name} is {value!r}, expected an integer of at least {least}")
             object.__setattr__(self, name, operator.index(value))  # json cannot write NumPy's numbers
+        if isinstance(self.workers, str) and not _SCHEDULER.fullmatch(self.workers):
+            raise InputError(f"the scheduler is {self.workers!r}, expected an address such as tcp://host:8786")
         if self.memory is not None:
             object.__setattr__(self, "memory", parse_size(self.memory))
 

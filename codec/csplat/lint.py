@@ -9,6 +9,7 @@ part of the scene.
 |---|---|---|
 | `missing-columns` | a required column is absent | error |
 | `sh-columns` | f_rest columns that match no SH degree up to 4, or are not numbered from 0 | error |
+| `repeated-names` | two elements, or two columns of one, with the same name | error |
 | `ambiguous-columns` | two columns with the same meaning under other programs' names | error |
 | `colour-columns` | red, green and blue that are neither bytes nor in 0 to 1 | error |
 | `integer-columns` | integers instead of floats | error |

@@ -522,7 +522,7 @@ BAD_COLUMNS = {
         "not a PLY of Gaussian splats, but anchors of Scaffold-GS"),
     "another scale": (ply(good_rows(names=[*without(*SCALES), "scale_x"])),
         "no column scale_0, scale_1, scale_2.* it has x"),
-    "two columns x": (ply(good_rows(), bytes(20), after=["property float x"]), "same name"),
+    "two columns x": (ply(good_rows(), bytes(20), after=["property float x"]), "column x: declared twice"),
     "two opacities": (ply(good_rows(names=[*without("opacity"), "scalar_opacity", "Opacity"])),
         "both be opacity: rename"),
     "a gap": (ply(good_rows(names=[one.replace("rest_3", "rest_45") for one in NAMES])), "not numbered from 0 to"),

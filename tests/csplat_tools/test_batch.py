@@ -79,6 +79,21 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes):
             names(scenes / "l.jsonl")
 
 
+def test_outputs_that_cannot_be_are_refused_before_any_work(scenes):
+    (scenes / "l.jsonl").write_text('{"path": "a.ply", "output": "x"}\n{"path": "sub/b.spz", "output": "./x"}')
+    (scenes / "m.jsonl").write_text('{"path": "a.ply", "output": "index.html"}')
+    for where, command, ending, message in (
+        ("l.jsonl", "encode", None, "x is the output of 2 scenes"),
+        ("m.jsonl", "encode", None, "index.html is the page of the batch"),
+        ("", "encode --dry-run", None, "--dry-run writes no output"),
+        ("", "convert", "spz", "expected a file name ending"),
+        ("", "encode", "/../x.csplat", "expected a file name ending"),
+        (".", "decode", None, "has no scenes for `csplat decode` outside of"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            find_tasks(scenes / where, command.split(), ending, "*", scenes)
+
+
 @pytest.mark.slow
 def test_outputs_equal_those_of_the_command_and_are_not_made_again(scenes, tmp_path):
     out, alone = tmp_path / "out", tmp_path / "alone.csplat"

@@ -77,6 +77,10 @@ def test_losses_are_reported_refused_and_predicted(tmp_path, ply, make_model):
     assert "does not keep all of" in call("convert", ply, out, "--no-loss", status=1).stderr
     assert not out.exists()
     assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
+    header, _, rows = ply.read_bytes().partition(b"end_header\n")
+    more, extra = b"element face 1\nproperty float a\nend_header\n", tmp_path / "more.ply"
+    extra.write_bytes(header + more + rows + bytes(4))
+    assert "other-elements: " in call("convert", extra, tmp_path / "b.ply", "--no-loss", status=1).stderr
     expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
     assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
     write_ply(far, with_values(make_model(40, 1), "sh0", 5, np.float32(5.0)))
@@ -298,12 +302,13 @@ def test_axes_are_converted_and_recorded(tmp_path, ply):
 @pytest.mark.slow
 def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
     nothing = ("--crop", "90,90,90,1", "--quiet", "--json")
-    for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
+    for suffix in ("ply", "csplat", "spz", "compressed.ply", "sog"):
         done, out = call("convert", ply, tmp_path / f"a.{suffix}", *nothing), tmp_path / f"a.{suffix}"
         assert f"warning: --crop keeps none of 200 splats: {out} has no splats" in done.stderr
         result = json.loads(done.stdout)
         assert (200, 0) == (result["source_splats"], result["splats"])
-    assert "no splats are left" in call("convert", ply, tmp_path / "a.glb", *nothing, status=1).stderr
+    for suffix in ("glb", "splat"):
+        assert "no splats are left" in call("convert", ply, tmp_path / f"a.{suffix}", *nothing, status=1).stderr
     assert "warning" not in call("convert", ply, tmp_path / "b.ply", "--crop", "0,0,0,1").stderr
 
 

@@ -24,6 +24,8 @@ from csplat_render.first_view import first_view
 from csplat_render.metrics import psnr
 from csplat_tools import render_files
 from csplat_tools.cli.shared_options import parse_colour
+from csplat_tools.inspect import comparison
+from csplat_tools.present import scene_renders
 
 
 @pytest.fixture
@@ -242,3 +244,27 @@ def test_films_of_invalid_sizes_or_formats_are_refused_and_durations_do_not_drif
     with pytest.raises(InputError, match="cannot write WEBP"):
         render_files.write_film(str(tmp_path / "a.webp"), [np.zeros((2, 2, 3), np.uint8)] * 2, 25.0)
     assert [] == names(tmp_path)
+
+
+def test_images_are_removed_if_not_all_are_made(ply, tmp_path, monkeypatch):
+    write, out = scene_renders.write_png, tmp_path / "out"
+    for module, words in (
+        (scene_renders, ("render", ply, out, "--orbit", 3, "--size", "16x16")),
+        (comparison, ("compare", ply, ply, "--pictures", out)),
+    ):
+
+        def fail_at_the_second(path, image):
+            if "0001" in path.name:
+                raise OSError(28, "No space left on device", str(path))
+            write(path, image)
+
+        monkeypatch.setattr(module, "write_png", fail_at_the_second)
+        call(*words, status=1)
+        assert not out.exists()
+
+
+def test_files_beside_a_manifest_are_not_replaced(ply, tmp_path):
+    (tmp_path / "sh0.webp").write_text("mine")
+    assert "sh0.webp exists" in call("convert", ply, tmp_path / "meta.json", status=1).stderr
+    call("convert", ply, tmp_path / "meta.json", "--force", "--quiet")
+    assert "is the input" in call("convert", tmp_path, tmp_path / "meta.json", "--force", status=1).stderr

@@ -152,6 +152,19 @@ def test_a_closed_or_full_standard_stream_is_an_error_of_one_line(tmp_path):
     assert (tmp_path / "new.csplat").read_bytes().startswith(_spec.MAGIC)
 
 
+def test_inputs_without_a_name_and_addresses_without_a_port_are_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words, line in (
+        (("encode", "."), ". is a folder, not a scene"), (("export-html", "/"), "/ is a folder, not a scene"),
+        (("decode", ""), "an empty name is a folder"),
+        (("batch", ".", "out", "--scheduler", "here"), "expected an address such as tcp://host:8786"),
+        (("compare", "a.ply", "b.ply", "--pictures", "c.png"), "expected a folder or a page"),
+    ):  # fmt: skip
+        done = invoke(*words)
+        assert done.exit_code, words
+        assert (1, True) == (done.stderr.count("\n"), line in done.stderr), done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_is_status_of_its_signal_and_leaves_nothing(tmp_path, number):

@@ -11,6 +11,7 @@ import csv
 import json
 import multiprocessing
 import os
+import posixpath
 import re
 import signal
 import subprocess
@@ -50,7 +51,7 @@ from csplat.system import interrupts_held, interrupts_noted, split_words
 from csplat_render.kernels import thread_count
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
-from csplat_tools.file_streams import is_csplat, write_bytes
+from csplat_tools.file_streams import is_csplat, write_text
 
 PAGE = "index.html"
 _MARK = "<!-- csplat batch -->"  # in our pages; a page without it is somebody else's, and is kept
@@ -64,6 +65,7 @@ _COMMANDS: dict[str, tuple[str, bool | None]] = {
     "simplify": (".ply", None), "finetune": (".csplat", None), "train": ("", None), "render": ("", None),
     "export-html": (".html", None), "sensitivity": (".npz", None),
 }  # fmt: skip
+_IN_NO_BATCH = {"--dry-run", "--help", "--help-all"}  # options with which a command writes no output
 _STATUS_USAGE, _STATUS_ENDED = 2, 130  # exit status: a wrong command line; a worker that ended on request
 _POLL_SECONDS, _CLEANUP_SECONDS = 0.1, 1.0  # between looks for an interrupt; for a worker to remove unfinished files
 
@@ -190,7 +192,7 @@ def run_batch(
     if page.exists() and not force and _MARK.encode() not in read_bytes(page):
         return replace(done, has_page=False)
     target.mkdir(parents=True, exist_ok=True)
-    write_bytes(str(page), make_batch_page(done).encode())
+    write_text(str(page), make_batch_page(done))
     return done
 
 
@@ -248,6 +250,10 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
     ending = _COMMANDS[command[0]][0] or None if ending is None else ending
     if ending is None:
         raise CommandLineError(f"csplat {command[0]} writes several formats: choose one with --ending, such as .spz")
+    if (ending[:1] != "." and (ending or command[0] != "render")) or "/" in ending or "\\" in ending:
+        raise CommandLineError(f"--ending is {ending!r}, expected a file name ending such as .spz")
+    if refused := _IN_NO_BATCH.intersection(command):
+        raise CommandLineError(f"{min(refused)} writes no output, and cannot run in batch")
     path.stat()  # raises an OSError that names it
     if path.is_dir():
         scenes = [(Task(str(path / name), ""), name) for name in _find_scenes(path, command[0], match, without)]
@@ -256,7 +262,9 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
     else:
         raise InputError(f"{path} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
     if not scenes:
-        raise InputError(f"{path} has no scenes for `csplat {command[0]}`")
+        is_inside = path.is_dir() and resolve_links(path).is_relative_to(resolve_links(without))
+        inside = f" outside of {without}" if is_inside else ""
+        raise InputError(f"{path} has no scenes for `csplat {command[0]}`{inside}")
     root = resolve_links(path).name if path.is_dir() else path.stem
     short = [task.output or _output_name(within, root, ending) for task, within in scenes]
     uses = Counter(short)  # outputs that would have one name keep the endings of their sources
@@ -264,6 +272,9 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
         replace(task, output=name if task.output or uses[name] == 1 else _output_name(within, root, ending, whole=True))
         for (task, within), name in zip(scenes, short, strict=True)
     ]
+    for task in tasks:
+        if task.output == PAGE:
+            raise InputError(f"{PAGE} is the page of the batch: name another output for {task.source} in a manifest")
     output, count = Counter(task.output for task in tasks).most_common(1)[0]
     if count > 1:
         raise InputError(f"{output} is the output of {count} scenes: name their outputs in a manifest")
@@ -332,6 +343,7 @@ def _read_manifest(manifest: Path) -> Iterator[tuple[Task, str]]:
         except (InputError, AttributeError, TypeError, ValueError, csv.Error):
             where = f"{manifest.name}, line {number}"
             raise InputError(f"{where}: expected a path, an output inside of OUT, words as options") from None
+        output = output if is_url(output) or not output else posixpath.normpath(output)
         yield Task(source if is_url(source) else str(manifest.parent / source), output, words), within
 
 

@@ -20,7 +20,7 @@ from csplat.encoder import PresetName
 from csplat.errors import InputError
 from csplat.formats import format_by_name, format_by_suffix, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
-from csplat.lint import Finding
+from csplat.lint import Finding, refuse
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.scene_metadata import UNSPECIFIED, UP
@@ -195,7 +195,8 @@ def _inside_box(model: SplatModel, corners: F64) -> Mask:
 def _inside_sphere(model: SplatModel, sphere: F64) -> Mask:
     """Return True, [N], for centres within a sphere, [4]: its centre in world coordinates, and its radius."""
     places = model.means + np.array(model.origin)
-    inside: Mask = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
+    with np.errstate(over="ignore"):
+        inside: Mask = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
     return inside
 
 
@@ -349,6 +350,8 @@ def convert_file(
         )  # fmt: skip
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
+        if no_loss:
+            refuse(reader.findings, strict=True)
         reporting = [
             changed if keeps else with_progress(changed, f"reading level {level + at}" if more else "reading", progress)
             for at, changed in enumerate(levels)

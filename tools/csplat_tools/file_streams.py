@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
 from csplat.detect import detect_content, detect_name, read_head, refusal
-from csplat.disk_files import atomic_writer, local_file, resolve_links, temporary_file
+from csplat.disk_files import FOLDER_NAMES, atomic_writer, local_file, resolve_links, temporary_file
 from csplat.errors import CsplatError, InputError
 from csplat.file_source import File, map_file, named_errors, open_binary, read_bytes
 from csplat.formats import formats
@@ -93,7 +93,7 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
         return
     target, resolved = Path(path), resolve_links(path)
     if target.is_dir():
-        raise InputError(f"{path} is a folder, expected the name of a file")
+        raise InputError(f"{path or 'an empty name'} is a folder, expected the name of a file")
     _free.discard(resolved)
     if not target.exists():
         target.parent.stat()  # raises an OSError that names the folder
@@ -103,8 +103,10 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
             _free.add(resolved)
         return
     for source in inputs:
-        if source != STANDARD_STREAM and Path(source).exists() and target.samefile(source):
-            raise InputError(f"{path} is the input: name another output")
+        if source != STANDARD_STREAM and Path(source).exists():
+            is_folder = Path(source).is_dir() and target.name in FOLDER_NAMES
+            if (target.parent if is_folder else target).samefile(source):
+                raise InputError(f"{path} is the input: name another output")
     if target.is_file() and not force:
         raise InputError(f"{path} exists: --force replaces it")
 
@@ -280,6 +282,11 @@ def write_bytes(path: str, data: bytes) -> None:
     """Write to a file or to standard output. Devices and named pipes are written directly."""
     with _output_stream(path) as stream:
         stream.write(data)
+
+
+def write_text(path: str, text: str) -> None:
+    """Write text in UTF-8; names of files that are not UTF-8 keep their bytes."""
+    write_bytes(path, text.encode("utf-8", "surrogateescape"))
 
 
 @contextmanager

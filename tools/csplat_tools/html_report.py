@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -176,9 +177,8 @@ class Head:
         if self.kind == "number":
             return f'<td data-value="{"" if more is None else f"{more:.6g}"}">{escape(text)}</td>'
         hint = f' title="{escape(more)}"' if more else ""
-        shown = (
-            f'<a href="{escape(quote(text, safe="/:"))}">{escape(text)}</a>' if self.kind == "link" else escape(text)
-        )
+        address = quote(os.fsencode(text), safe="/:")
+        shown = f'<a href="{escape(address)}">{escape(text)}</a>' if self.kind == "link" else escape(text)
         return f'<td class="name" data-value="{escape(text)}"{hint}>{shown}</td>'
 
 

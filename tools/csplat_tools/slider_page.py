@@ -37,6 +37,11 @@ class Panel:
         return cls(title, remark, data_uri(pixels), (pixels.shape[1], pixels.shape[0]))
 
 
+def is_page(path: str) -> bool:
+    """Return True for the name of a page, False for that of a folder."""
+    return path.lower().endswith(".html")
+
+
 def slider_page(title: str, about: str, views: Sequence[Sequence[Panel]]) -> str:
     """Return the page.
 

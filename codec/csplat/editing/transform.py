@@ -177,7 +177,8 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     doubles = None if model.means_double is None else model.means_double + step
     means = model.means + step if doubles is None else doubles - np.array(model.origin)
     metadata = _with_cameras(model.metadata, lambda camera: _translate_camera(camera, step))
-    return replace(model, means=means.astype(np.float32), means_double=doubles, metadata=metadata)
+    with np.errstate(over="ignore"):  # infinity is refused
+        return replace(model, means=means.astype(np.float32), means_double=doubles, metadata=metadata)
 
 
 def rotation_to_axes(metadata: SceneMetadata, axes: str) -> F64:

@@ -96,6 +96,8 @@ def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
 def _write(path: Path, scene: Scene) -> None:
     """Write a file (`Format.write`): SH of degree 0 and no metadata."""
     with atomic_writer(path) as stream:
+        if not scene.count:
+            raise InputError(f"{path.name}: no splats are left to write, and an empty file is not a scene")
         for model in scene.blocks():
             rows = np.empty(len(model), _ROW)
             rows["means"] = model.means

@@ -9,6 +9,7 @@ text is an error that names the number or row.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -127,7 +128,24 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
     if wrong is not None:
         raise InputError(f"{path.name}: the count {wrong[:_SHOWN].decode()!r} of an element is not a whole number")
     findings += _count_findings(lines, path.stat().st_size)
+    findings += _repeated_names(lines)
     return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
+
+
+def _repeated_names(lines: Sequence[Sequence[bytes]]) -> list[Finding]:
+    """Return the finding for elements, or columns of one element, of the same name; empty without any."""
+    elements, columns, repeated = Counter[str](), Counter[str](), list[str]()
+    for words in lines:
+        names = words[-1].decode("ascii", "replace") if words else ""
+        if _is_element(words):
+            elements[words[1].decode("ascii", "replace")] += 1
+            columns.clear()
+        elif words[:1] == [b"property"]:
+            columns[names] += 1
+            repeated += [f"column {names}"] * (columns[names] == 2)
+    repeated += [f"element {name}" for name, count in elements.items() if count > 1]
+    what = f"{', '.join(repeated)}: declared twice"
+    return [Finding("repeated-names", len(repeated), what, "error")] if repeated else []
 
 
 def _split(text: bytes) -> list[bytes]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.types import Progress
 from csplat_tools.console import LONG_WORK_SECONDS, format_estimate, note, print_data, print_json, progress_bar
@@ -22,8 +23,7 @@ TRUSTS_PATHS = ContextVar("TRUSTS_PATHS", default=False)
 
 #: File name endings of the outputs of options.
 _ENDINGS = {
-    "--report": ".json", "--page": ".html", "-o": ".html", "--source-index": ".npy", "--checkpoint": ".npz",
-    "--preview": ".png",
+    "--report": ".json", "--page": ".html", "--source-index": ".npy", "--checkpoint": ".npz", "--preview": ".png",
 }  # fmt: skip
 
 
@@ -31,11 +31,16 @@ def default_output(output: str | None, source: str, ending: str) -> str:
     """Return the output, or the source's name with another ending if no output is given.
 
     Raises:
+        InputError: no output is given, and the source has no name: `.`, `/` or nothing.
         typer.BadParameter: no output is given, and the source is standard input.
     """
-    if output is None and source == STANDARD_STREAM:
+    if output is not None:
+        return output
+    if source == STANDARD_STREAM:
         raise typer.BadParameter("expected an output: OUT, or - for standard output")
-    return str(Path(source).with_suffix(ending)) if output is None else output
+    if not Path(source).name:
+        raise InputError(f"{source or 'an empty name'} is a folder, not a scene")
+    return str(Path(source).with_suffix(ending))
 
 
 @dataclass(frozen=True)

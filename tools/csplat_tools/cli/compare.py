@@ -18,7 +18,10 @@ from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import findings_of, load_scene, open_scenes, sample_scene
+from csplat_tools.slider_page import is_page
 from csplat_tools.views import Split
+
+_NO_FOLDER = (".csplat", ".gif", ".htm", ".jpeg", ".jpg", ".json", ".pdf", ".ply", ".png", ".webp")  # endings
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
@@ -75,7 +78,9 @@ def compare(
     out = Output(force, report, as_json, quiet)
     views = shared.ViewOptions(cameras, data, background, test_every)
     shared.require_one({"--split": split != "test", "--test-every": test_every}, {"--data": data})
-    page, folder = (pictures, None) if pictures is not None and pictures.endswith(".html") else (None, pictures)
+    if pictures is not None and (pictures in ("", STANDARD_STREAM) or Path(pictures).suffix.lower() in _NO_FOLDER):
+        raise typer.BadParameter(f"--pictures is {pictures!r}, expected a folder or a page, such as page.html")
+    page, folder = (pictures, None) if pictures is not None and is_page(pictures) else (None, pictures)
     out.check(page, inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")

@@ -33,7 +33,7 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
 from csplat_tools.console import note, print_data
-from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.file_streams import STANDARD_STREAM, write_text
 from csplat_tools.optional_packages import require_renderer
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
@@ -239,7 +239,7 @@ def _publish(report: ConformanceReport, out: Output, junit: str | None, nothing:
     if junit == STANDARD_STREAM:
         print_data(to_junit(report).rstrip("\n"))
     elif junit is not None:
-        write_bytes(junit, to_junit(report).encode())
+        write_text(junit, to_junit(report))
     out.publish(to_json(report), "" if junit == STANDARD_STREAM else to_table(report))
     if not report.outcomes:
         note(f"error: {nothing}")

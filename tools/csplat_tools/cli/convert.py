@@ -102,7 +102,12 @@ def convert(
     folder = Path(output).parent
     is_new_folder = Path(output).name in FOLDER_NAMES and not folder.exists()
     if not dry_run and not Path(output).is_dir():
-        out.check(str(folder) if is_new_folder else output, inputs=(source,))
+        beside: list[str] = []
+        if Path(output).name == "meta.json" and not is_new_folder:
+            from csplat.formats.sog.sog_writer import IMAGE_NAMES
+
+            beside = [str(folder / name) for name in IMAGE_NAMES]
+        out.check(str(folder) if is_new_folder else output, *beside, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
             source, output, read_as=read_as, write_as=write_as, level=chosen, max_splats=max_splats,

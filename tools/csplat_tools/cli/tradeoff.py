@@ -11,7 +11,7 @@ from csplat.context import Context
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import note
-from csplat_tools.file_streams import write_bytes
+from csplat_tools.file_streams import write_text
 from csplat_tools.optional_packages import require_plots, require_renderer
 
 
@@ -75,5 +75,5 @@ def tradeoff(
             context=context,
         )  # fmt: skip
         if page is not None:
-            write_bytes(page, make_tradeoff_page(measured).encode())
+            write_text(page, make_tradeoff_page(measured))
     out.publish(measured.as_json(), format_tradeoff(measured))

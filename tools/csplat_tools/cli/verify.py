@@ -65,7 +65,8 @@ def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> No
         clauses, codes = (
             ", ".join(sorted({getattr(violation, name) for violation in violations})) for name in ("clause", "code")
         )
-        note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
+        remedy = "--limit-splats allows fewer splats" if codes == "E_LIMIT" else "copy or make it again"
+        note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; {remedy} ({codes})")
     if unverified:
         note("error: the declared errors were not checked")
     for failure in verified.bounds.failures if verified.bounds is not None else ():

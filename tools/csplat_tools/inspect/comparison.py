@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -38,11 +39,11 @@ from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
 from csplat_render.scorer import OnView, Renderable, Scorer
 from csplat_tools.console import format_bytes
-from csplat_tools.file_streams import check_output, write_bytes
+from csplat_tools.file_streams import check_output, write_text
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
 from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
-from csplat_tools.slider_page import Panel, slider_page
+from csplat_tools.slider_page import Panel, is_page, slider_page
 from csplat_tools.views import VIRTUAL, Colour, DataOptions, ViewSet, find_view_set, views_off_path
 from csplat_tools.views.sliced_renderer import SlicedScene
 
@@ -230,7 +231,7 @@ def compare(
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
             folder = os.fspath(pictures)
-            if folder.endswith(".html"):
+            if is_page(folder):
                 page = _Page(folder, names, amplification, force=force)
                 viewers.append(page)
             else:
@@ -249,7 +250,13 @@ def compare(
             ignored = first.ignored
         else:
             scorer = views.test_scorer(first, mode=mode, background=background, context=context)
-            quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
+            try:
+                quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
+            except BaseException:
+                for viewer in viewers:
+                    if isinstance(viewer, _ImageWriter):
+                        viewer.remove()
+                raise
             ignored = scorer.reference(0).ignored
         if page is not None:
             page.write(source, other, quality)
@@ -497,12 +504,23 @@ class _ImageWriter:
         self, folder: str, names: Sequence[str], image_scorer: Scorer | None, amplification: float, *, force: bool
     ) -> None:
         self._files = [f"{name}.png" for name in names]
+        self._is_new = not Path(folder).exists()
         self._target = make_output_folder(folder, self._files, force=force)
+        self._written: list[Path] = []
         self._image_scorer, self._amplification = image_scorer, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
         shown = None if self._image_scorer is None else self._image_scorer.reference(number).rgb
-        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
+        self._written.append(self._target / self._files[number])
+        write_png(self._written[-1], side_by_side(a, b, self._amplification, shown))
+
+    def remove(self) -> None:
+        """Remove what was written, after an error or an interrupt."""
+        for file in self._written:
+            file.unlink(missing_ok=True)
+        if self._is_new:
+            with suppress(OSError):  # something else is in it
+                self._target.rmdir()
 
 
 class _Page:
@@ -532,7 +550,7 @@ class _Page:
             described = zip(panels, titles, [*remarks, ""], strict=True)
             views.append([replace(panel, title=title, remark=remark) for panel, title, remark in described])
         about = "Images are compressed for this page; scores are not measured on them."
-        write_bytes(self._path, slider_page(Path(self._path).stem, about, views).encode())
+        write_text(self._path, slider_page(Path(self._path).stem, about, views))
 
 
 def _all_of(viewers: Sequence[OnView]) -> OnView:

@@ -14,7 +14,7 @@ from csplat.decoder import DeclaredBounds, decode
 from csplat.types import null_progress
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
-from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.file_streams import STANDARD_STREAM, write_text
 from csplat_tools.inspect.file_description import (
     FileDescription,
     describe_coding,
@@ -97,7 +97,7 @@ def write_page(
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
     comparison = None if source is None else _compare_with_source(data, source, context)
-    write_bytes(path, make_page(title, description, comparison).encode())
+    write_text(path, make_page(title, description, comparison))
 
 
 def make_page(title: str, description: FileDescription, comparison: _SourceComparison | None = None) -> str:

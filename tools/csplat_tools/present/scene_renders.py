@@ -125,8 +125,8 @@ def render_folder(
     endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
     is_new = not Path(folder).exists()
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
-    files, ignored = [], 0
-    with _remove_if_empty(target if is_new else None):
+    files, ignored = list[Path](), 0
+    with _removed_if_unfinished(files, target if is_new else None):
         renders = _render_each(model, cameras, background, mode, backend, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
@@ -213,11 +213,13 @@ def _render_each(
 
 
 @contextmanager
-def _remove_if_empty(folder: Path | None) -> Iterator[None]:
-    """Remove a new folder if an error occurs while it is empty."""
+def _removed_if_unfinished(files: Sequence[Path], folder: Path | None) -> Iterator[None]:
+    """Remove the files that were written before an error or an interrupt, and a new folder if it is empty then."""
     try:
         yield
     except BaseException:
+        for file in files:
+            file.unlink(missing_ok=True)
         if folder is not None:
             with suppress(OSError):  # it is not empty
                 folder.rmdir()

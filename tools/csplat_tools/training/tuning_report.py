@@ -21,7 +21,7 @@ from csplat.types import U8
 from csplat_render.metrics import Distance
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes, format_seconds, format_table
-from csplat_tools.file_streams import write_bytes
+from csplat_tools.file_streams import write_text
 from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.render_files import to_uint8
@@ -254,7 +254,7 @@ def write_training_page(
     Raises:
         OSError: the page cannot be written.
     """
-    write_bytes(path, make_training_page(PurePath(name).name, training, file, shown).encode())
+    write_text(path, make_training_page(PurePath(name).name, training, file, shown))
 
 
 def make_training_page(
