@@ -137,7 +137,7 @@ function keepView() {
 async function measureFrames() {
   if (!current || isMeasuring) return;
   isMeasuring = true;
-  const { width, height } = showing.stage;
+  const { width, height } = showing.stage.full;
   try {
     measured.show(await measure({ ...current, rig: showing.rig, width, height }, (text) => overlay.toast(text)));
   } catch (error) {
