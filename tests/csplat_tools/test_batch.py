@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 
 import pytest
-from command_line import InThisProcess, call, heed_interrupts
+from command_line import InThisProcess, call
 
 import csplat
 from csplat import InputError
@@ -162,7 +162,7 @@ def test_an_ended_batch_leaves_no_processes_and_is_continued(scenes, tmp_path, n
     out, stuck = tmp_path / "out", scenes / "stuck.ply"
     os.mkfifo(stuck)  # without a size it comes last
     line = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "2"]
-    running = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts)  # noqa: PLW1509
+    running = subprocess.Popen(line, stderr=subprocess.PIPE, text=True)
     with stuck.open("wb"):  # waits for a worker to read it
         running.send_signal(number)
         error = running.communicate(timeout=60)[1]  # its processes have the same pipe

@@ -101,8 +101,3 @@ class InThisProcess(Executor):
             future.set_exception(error)
         signal.signal(signal.SIGINT, before)  # the program has its own handler
         return future
-
-
-def heed_interrupts():
-    """Restore SIGINT in a child process: a shell that runs the tests in the background makes it ignored."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)

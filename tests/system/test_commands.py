@@ -13,7 +13,7 @@ import threading
 
 import numpy as np
 import pytest
-from command_line import PROGRAM, heed_interrupts, invoke, printed, refused, status_of
+from command_line import PROGRAM, invoke, printed, refused, status_of
 
 import csplat
 from csplat import _spec
@@ -178,7 +178,7 @@ def test_an_interrupt_is_status_of_its_signal_and_leaves_nothing(tmp_path, numbe
 
 def child(command, **options):
     streams = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    return subprocess.Popen(command, preexec_fn=heed_interrupts, **streams, **options)  # noqa: PLW1509  # one signal
+    return subprocess.Popen(command, **streams, **options)  # one signal
 
 
 #: A module in whose import the interrupt becomes another error.

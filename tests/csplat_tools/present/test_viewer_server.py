@@ -21,7 +21,7 @@ import pytest
 import typer
 from checked import cloud
 from chromium import ViewerPage
-from command_line import call, heed_interrupts
+from command_line import call
 
 from csplat import FormatError, InputError, decode, encode, write_ply
 from csplat.ply import read_ply
@@ -280,7 +280,7 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
     line, pipe = [sys.executable, "-m", "csplat_tools", "view", str(sample_path), "--no-browser"], subprocess.PIPE
     streams = {"stdin": subprocess.DEVNULL, "stdout": pipe, "stderr": pipe, "text": True}
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(line, **streams, env=environment, preexec_fn=heed_interrupts) as process:  # noqa: PLW1509
+    with subprocess.Popen(line, **streams, env=environment) as process:
         try:
             url = process.stdout.readline().strip()
             assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
