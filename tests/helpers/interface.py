@@ -11,12 +11,12 @@ from __future__ import annotations
 import inspect
 import json
 import re
-import sys
 import textwrap
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import typer
@@ -118,23 +118,25 @@ def _results() -> str:
     """Return the classes that no package exports: results of its functions, members of its classes, and `FitStep`."""
     packages = [import_module(package) for package in PACKAGES]
     exported = {name: getattr(package, name) for package in packages for name in package.__all__}
-    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in PACKAGES]
-    classes = {name: value for one in modules for name, value in vars(one).items() if inspect.isclass(value)}
-    found = {"FitStep"}
+    defined = {name: module for package in packages for name, module in _definitions(package)}
+    found = {"FitStep": defined["FitStep"]}
     for value in exported.values():
-        texts = (
-            _members(value).values()
-            if inspect.isclass(value)
-            else [getattr(value, "__annotations__", {}).get("return")]
-        )
-        known = classes | vars(sys.modules[getattr(value, "__module__", "csplat")])
+        is_class = inspect.isclass(value)
+        texts = _members(value).values() if is_class else [getattr(value, "__annotations__", {}).get("return")]
+        near = vars(import_module(getattr(value, "__module__", "csplat")))
         for word in re.findall(r"\w+", " ".join(map(str, texts))):
-            found |= (
-                {word}
-                if inspect.isclass(known.get(word)) and known[word].__module__.partition(".")[0] in PACKAGES
-                else set()
-            )
-    return _list("results of these", (_python_entry(name, classes[name]) for name in sorted(found - exported.keys())))
+            if word in defined and word not in exported and inspect.isclass(near.get(word, type)):
+                found[word] = getattr(near.get(word), "__module__", defined[word])
+    classes = {name: getattr(import_module(module), name) for name, module in sorted(found.items())}
+    return _list("results of these", (_python_entry(name, value) for name, value in classes.items()))
+
+
+def _definitions(package: ModuleType) -> Iterator[tuple[str, str]]:
+    """Yield the classes in the sources of a package, with their modules, whether or not these can be imported."""
+    folder = Path(package.__path__[0])
+    for path in sorted(folder.rglob("*.py")):
+        module = ".".join([package.__name__, *path.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__")
+        yield from ((name, module) for name in re.findall(r"(?m)^class (\w+)", path.read_text("utf-8")))
 
 
 def _module(title: str, path: Path) -> str:
