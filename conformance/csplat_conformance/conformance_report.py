@@ -43,16 +43,21 @@ class Status(StrEnum):
     PASSED = "passed"
     WARNED = "warned"  #: passed, but much worse than necessary
     DECLINED = "declined"  #: refused an input that may be refused
-    NOT_PROVED = "not proved"  #: neither confirmed nor contradicted
+    NOT_PROVED = "not_proved"  #: neither confirmed nor contradicted
     FAILED = "failed"  #: the answer is wrong
     CRASHED = "crashed"  #: ended by a signal
     HUNG = "hung"  #: did not end in time
-    WRONG_STATUS = "wrong status"  #: an exit status that the protocol does not define
-    WRONG_ANSWER = "wrong answer"  #: a valid exit status, without the line or the files that it requires
-    NO_OUTPUT = "no output"  #: exit status 0, but nothing was written
-    PARTIAL_OUTPUT = "partial output"  #: a truncated file, or a file left by a failed run
+    WRONG_STATUS = "wrong_status"  #: an exit status that the protocol does not define
+    WRONG_ANSWER = "wrong_answer"  #: a valid exit status, without the line or the files that it requires
+    NO_OUTPUT = "no_output"  #: exit status 0, but nothing was written
+    PARTIAL_OUTPUT = "partial_output"  #: a truncated file, or a file left by a failed run
     REFUSED = "refused"  #: refused an input that must be accepted
     SKIPPED = "skipped"  #: not checked; the message gives the reason
+
+    @property
+    def text(self) -> str:
+        """The status in words."""
+        return self.replace("_", " ")
 
 
 _GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
@@ -166,7 +171,7 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
     lines += [""] * bool(lines)
     lines += [*report.notes]
     counts = [*report.levels().items(), ("all", report.counts())]
-    header = ("level", *counts[-1][1])
+    header = ("level", *(name.replace("_", " ") for name in counts[-1][1]))
     rows = [(level, *map(str, count.values())) for level, count in counts]
     badge = ["", report.badge] if report.badge else []
     return "\n".join([*lines, *_align_columns([header, *rows], right=True), *badge])
@@ -174,7 +179,7 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
 
 def _word(status: Status) -> str:
     """Return the word for a status, in capitals for failures."""
-    return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
+    return "ok" if status is Status.PASSED else status.text if status in _GOOD else status.text.upper()
 
 
 def _remark(outcome: Outcome) -> str:
@@ -261,10 +266,10 @@ def _junit_case(outcome: Outcome, suite: str) -> str:
     if outcome.status is Status.WARNED:
         return f"{head}><system-out>{_xml(f'warning: {outcome.message}')}</system-out></testcase>"
     if outcome.status in _OPEN:
-        message = outcome.message if outcome.status is Status.SKIPPED else f"{outcome.status}: {outcome.message}"
+        message = outcome.message if outcome.status is Status.SKIPPED else f"{outcome.status.text}: {outcome.message}"
         return f'{head}><skipped message="{_xml(message)}"/></testcase>'
     kind = "error" if outcome.status in _ERRORS else "failure"
-    message = f'message="{_xml(f"{outcome.status}: {_remark(outcome)}")}"'
+    message = f'message="{_xml(f"{outcome.status.text}: {_remark(outcome)}")}"'
     return f'{head}><{kind} type="{_xml(outcome.code or str(outcome.status))}" {message}/></testcase>'
 
 

@@ -23,7 +23,7 @@ def test_warnings_refusals_and_unproved_errors_are_counted_but_are_no_failures()
     assert REPORT.passed
     for line in ("L3  warned      b  coarse <", "L3  not proved  c  fitted anew", *REPORT.notes):
         assert line in to_table(REPORT)
-    counts = {"checks": 3, "passed": 1, "warned": 1, "declined": 0, "not proved": 1, "failed": 0, "skipped": 0}
+    counts = {"checks": 3, "passed": 1, "warned": 1, "declined": 0, "not_proved": 1, "failed": 0, "skipped": 0}
     assert counts == to_json(REPORT)["levels"]["L3"]
     decoder = ConformanceReport("decoder", "x", REPORT.outcomes[:1])
     assert ["checks", "passed", "failed", "skipped"] == list(decoder.levels()["L3"])

@@ -245,6 +245,7 @@ def keys_group(folder: Path) -> Iterator[tuple[str, Json]]:
         ("merge", ("merge", file, other, "-o", folder / "merged.csplat")),
         ("convert", ("convert", small, folder / "small.spz")),
         ("compare", ("compare", small, file, "--cameras", views)),
+        ("compare --data", ("compare", small, file, "--data", images)),
         ("tradeoff", ("tradeoff", small, "--cameras", views, "--what", "presets")),
         ("render", ("render", small, folder / "renders", "--cameras", views)),
         ("simplify", ("simplify", small, folder / "simple.ply", "--keep", "0.6", "--cameras", views)),
@@ -255,6 +256,7 @@ def keys_group(folder: Path) -> Iterator[tuple[str, Json]]:
         ("export-html", ("export-html", file, folder / "page.html")),
         ("export-element", ("export-element", folder / "element.js")),
         ("conformance decoder", ("conformance", "decoder", "--filter", "valid/quats*")),
+        ("conformance encoder", ("conformance", "encoder", "--filter", "*/one_splat", "--level", "1")),
         ("batch", ("batch", scenes_folder, folder / "batch", "--", "encode", "--preset", "fast")),
     )  # fmt: skip
     found: dict[str, set[str]] = {}
