@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -177,7 +176,7 @@ class Head:
         if self.kind == "number":
             return f'<td data-value="{"" if more is None else f"{more:.6g}"}">{escape(text)}</td>'
         hint = f' title="{escape(more)}"' if more else ""
-        address = quote(os.fsencode(text), safe="/:")
+        address = quote(text.encode("utf-8", "surrogateescape"), safe="/:")
         shown = f'<a href="{escape(address)}">{escape(text)}</a>' if self.kind == "link" else escape(text)
         return f'<td class="name" data-value="{escape(text)}"{hint}>{shown}</td>'
 

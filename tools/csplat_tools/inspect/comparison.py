@@ -511,8 +511,8 @@ class _ImageWriter:
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
         shown = None if self._image_scorer is None else self._image_scorer.reference(number).rgb
+        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
         self._written.append(self._target / self._files[number])
-        write_png(self._written[-1], side_by_side(a, b, self._amplification, shown))
 
     def remove(self) -> None:
         """Remove what was written, after an error or an interrupt."""

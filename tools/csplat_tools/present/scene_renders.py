@@ -130,15 +130,15 @@ def render_folder(
         renders = _render_each(model, cameras, background, mode, backend, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
+            write_png(target / f"{name}.png", to_uint8(result.rgb))
             files.append(target / f"{name}.png")
-            write_png(files[-1], to_uint8(result.rgb))
             if alpha:
+                write_png(target / f"{name}.alpha.png", to_uint8(result.alpha))
                 files.append(target / f"{name}.alpha.png")
-                write_png(files[-1], to_uint8(result.alpha))
             if depth:
-                files.append(target / f"{name}.depth.npy")
                 assert isinstance(result, RenderResult)  # the CPU's
-                write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
+                write_array(str(target / f"{name}.depth.npy"), _mean_depth(result.depth, result.alpha))
+                files.append(target / f"{name}.depth.npy")
     return Rendered(tuple(files), ignored)
 
 
