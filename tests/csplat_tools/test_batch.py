@@ -182,3 +182,11 @@ def test_the_workers_of_a_cluster_write_the_same_bytes(scenes, tmp_path):
         call("batch", scenes, out, "--scheduler", cluster.scheduler_address, "--", *FAST, status=1)
     call(*FAST, scenes / "a.ply", alone, "--quiet")
     assert alone.read_bytes() == (out / "a.csplat").read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf_8_are_links_on_the_page(scenes, tmp_path):
+    (scenes / "a.ply").rename(scenes / "a\udcff.ply")
+    done = run_batch(scenes, tmp_path / "out", FAST, match="*.ply")
+    assert [("a\udcff.csplat", "done")] == [(one.output, one.state) for one in done.results if one.state == "done"]
+    assert b'<a href="a%FF.csplat">a\xff.csplat</a>' in (tmp_path / "out" / "index.html").read_bytes()
