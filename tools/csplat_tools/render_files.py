@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -37,6 +38,20 @@ def image_names(images: Sequence[str | None]) -> list[str]:
     if len({name.casefold() for name in names}) == len(names):
         return names
     return [f"{number}_{stem}" if stem else number for stem, number in zip(stems, numbers, strict=True)]
+
+
+@contextmanager
+def removed_if_unfinished(files: Sequence[Path], folder: Path | None) -> Iterator[None]:
+    """Remove the files that were written before an error or an interrupt, and a new folder if it is empty then."""
+    try:
+        yield
+    except BaseException:
+        for file in files:
+            file.unlink(missing_ok=True)
+        if folder is not None:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+        raise
 
 
 def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Path:

@@ -141,10 +141,11 @@ class _Training:
         if not data.train:
             raise InputError("there are no images to train on")
         data.read()
-        options = replace(options, seed=context.seed if options.seed is None else options.seed)
+        seed = context.seed if options.seed is None else options.seed
+        options = replace(options, seed=seed)
         self._data, self._options, self._outputs, self._show = data, options, outputs, show
         self._scene = measure_extent(data.inliers)
-        self._fitter = Fitter(len(data.train), options.iterations, options.seed or 0)
+        self._fitter = Fitter(len(data.train), options.iterations, seed)
         self._log = self._fitter.log
         self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}

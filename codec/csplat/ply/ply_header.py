@@ -136,13 +136,13 @@ def _repeated_names(lines: Sequence[Sequence[bytes]]) -> list[Finding]:
     """Return the finding for elements, or columns of one element, of the same name; empty without any."""
     elements, columns, repeated = Counter[str](), Counter[str](), list[str]()
     for words in lines:
-        names = words[-1].decode("ascii", "replace") if words else ""
         if _is_element(words):
             elements[words[1].decode("ascii", "replace")] += 1
             columns.clear()
         elif words[:1] == [b"property"]:
-            columns[names] += 1
-            repeated += [f"column {names}"] * (columns[names] == 2)
+            name = words[-1].decode("ascii", "replace")
+            columns[name] += 1
+            repeated += [f"column {name}"] * (columns[name] == 2)
     repeated += [f"element {name}" for name, count in elements.items() if count > 1]
     what = f"{', '.join(repeated)}: declared twice"
     return [Finding("repeated-names", len(repeated), what, "error")] if repeated else []

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -41,7 +41,7 @@ from csplat_render.scorer import OnView, Renderable, Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import check_output, write_text
 from csplat_tools.optional_packages import require_images, require_renderer
-from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
+from csplat_tools.render_files import image_names, make_output_folder, removed_if_unfinished, side_by_side, write_png
 from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
 from csplat_tools.slider_page import Panel, is_page, slider_page
 from csplat_tools.views import VIRTUAL, Colour, DataOptions, ViewSet, find_view_set, views_off_path
@@ -228,6 +228,7 @@ def compare(
         image_scorer = views.image_test_scorer(mode=mode, context=context) if views.images else None
         viewers: list[OnView] = []
         page: _Page | None = None
+        writer: _ImageWriter | None = None
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
             folder = os.fspath(pictures)
@@ -235,7 +236,8 @@ def compare(
                 page = _Page(folder, names, amplification, force=force)
                 viewers.append(page)
             else:
-                viewers.append(_ImageWriter(folder, names, image_scorer, amplification, force=force))
+                writer = _ImageWriter(folder, names, image_scorer, amplification, force=force)
+                viewers.append(writer)
         first: SplatModel | Renderable
         second: SplatModel | Renderable
         first, second, errors = _prepare_scenes(source, other, views.test, bound, source_index, context)
@@ -250,13 +252,8 @@ def compare(
             ignored = first.ignored
         else:
             scorer = views.test_scorer(first, mode=mode, background=background, context=context)
-            try:
+            with nullcontext() if writer is None else removed_if_unfinished(writer.files, writer.new_folder):
                 quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
-            except BaseException:
-                for viewer in viewers:
-                    if isinstance(viewer, _ImageWriter):
-                        viewer.remove()
-                raise
             ignored = scorer.reference(0).ignored
         if page is not None:
             page.write(source, other, quality)
@@ -503,24 +500,17 @@ class _ImageWriter:
     def __init__(
         self, folder: str, names: Sequence[str], image_scorer: Scorer | None, amplification: float, *, force: bool
     ) -> None:
-        self._files = [f"{name}.png" for name in names]
-        self._is_new = not Path(folder).exists()
-        self._target = make_output_folder(folder, self._files, force=force)
-        self._written: list[Path] = []
+        self._names, is_new = [f"{name}.png" for name in names], not Path(folder).exists()
+        self._target = make_output_folder(folder, self._names, force=force)
+        self.new_folder = self._target if is_new else None
+        self.files: list[Path] = []  # written so far
         self._image_scorer, self._amplification = image_scorer, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
         shown = None if self._image_scorer is None else self._image_scorer.reference(number).rgb
-        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
-        self._written.append(self._target / self._files[number])
-
-    def remove(self) -> None:
-        """Remove what was written, after an error or an interrupt."""
-        for file in self._written:
-            file.unlink(missing_ok=True)
-        if self._is_new:
-            with suppress(OSError):  # something else is in it
-                self._target.rmdir()
+        file = self._target / self._names[number]
+        write_png(file, side_by_side(a, b, self._amplification, shown))
+        self.files.append(file)
 
 
 class _Page:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +22,15 @@ from csplat_render.first_view import first_view
 from csplat_render.scorer import Renderable, renderer
 from csplat_tools.file_streams import check_output, write_array
 from csplat_tools.optional_packages import require_images, require_renderer
-from csplat_tools.render_files import check_film, image_names, make_output_folder, to_uint8, write_film, write_png
+from csplat_tools.render_files import (
+    check_film,
+    image_names,
+    make_output_folder,
+    removed_if_unfinished,
+    to_uint8,
+    write_film,
+    write_png,
+)
 from csplat_tools.views import BLACK, Colour, DataOptions, Split, find_view_set
 
 _DEFAULT_SIZE = (640, 480)
@@ -126,7 +133,7 @@ def render_folder(
     is_new = not Path(folder).exists()
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = list[Path](), 0
-    with _removed_if_unfinished(files, target if is_new else None):
+    with removed_if_unfinished(files, target if is_new else None):
         renders = _render_each(model, cameras, background, mode, backend, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
@@ -210,20 +217,6 @@ def _render_each(
         context.progress("rendering", number / len(cameras))
         yield draw(camera)
     context.progress("rendering", 1.0)
-
-
-@contextmanager
-def _removed_if_unfinished(files: Sequence[Path], folder: Path | None) -> Iterator[None]:
-    """Remove the files that were written before an error or an interrupt, and a new folder if it is empty then."""
-    try:
-        yield
-    except BaseException:
-        for file in files:
-            file.unlink(missing_ok=True)
-        if folder is not None:
-            with suppress(OSError):  # it is not empty
-                folder.rmdir()
-        raise
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:

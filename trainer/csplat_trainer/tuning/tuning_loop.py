@@ -119,13 +119,14 @@ class _Tuning:
         context: Context,
         size_bytes: int | None,
     ) -> None:
-        options = replace(options, seed=context.seed if options.seed is None else options.seed)
+        seed = context.seed if options.seed is None else options.seed
+        options = replace(options, seed=seed)
         self._views, self._options, self._outputs, self._show = views, options, outputs, show
         self._fixed, self._context = fixed, context
         self._engine = self._make_engine(None)
         log_size = np.median(np.median(fixed.encode_plan.model.scales, axis=1))
         self._typical_size = float(np.exp(np.clip(log_size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)))
-        self._fitter = Fitter(len(views.train), options.iterations, options.seed or 0)
+        self._fitter = Fitter(len(views.train), options.iterations, seed)
         self._log = self._fitter.log
         self._log |= {"validations": [], "views": views.digest}
         self._view_numbers = {id(view): number for number, view in enumerate(views.train)}

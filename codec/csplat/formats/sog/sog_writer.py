@@ -45,11 +45,9 @@ _ITERATIONS = 2  # k-means iterations; more gain 0.03 dB in three times the time
 _LARGEST_PALETTE = 1 << 16
 _PIXELS_AT_ONCE = 1 << 23  # pixels of all images compressed in parallel, which take 70 bytes of memory each
 _SAMPLE = 1 << 20  # number of splats from which codebooks and palette are computed
-#: The files next to a meta.json.
-IMAGE_NAMES = (
-    "means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
-)  # fmt: skip
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
+#: The files next to a meta.json.
+IMAGE_NAMES = (*_CHANNELS, "shN_centroids.webp", "shN_labels.webp")
 
 
 def write_sog(path: Path, scene: Scene) -> list[Finding]:
