@@ -6,6 +6,8 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14; 
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 UV := $(shell command -v uv)
+# The system's certificates, as pip does: a network may have its own.
+export UV_NATIVE_TLS ?= true
 # `make test RESOLUTION=lowest-direct`: the oldest versions that pyproject.toml allows; needs uv.
 RESOLUTION ?= highest
 INSTALL := $(if $(UV),$(UV) pip install --quiet --resolution $(RESOLUTION) --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile)
