@@ -187,7 +187,7 @@ def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, de
 
 def order_0_entropy(counts: NDArray[np.integer]) -> float:
     """Return the entropy, bits per symbol, of symbols with these counts, all positive."""
-    shares = counts / max(1, counts.sum())
+    shares = counts / max(1, int(counts.sum()))
     return -float((shares * log2(shares)).sum())
 
 

@@ -135,7 +135,7 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
         classes = reassigned
         octaves = _octaves(sample, classes, integers)
     splats = np.bincount(classes)[np.unique(classes)] * (len(errors) / len(sample))
-    large: F64 = octaves[splats >= min(_CLASS_SPLATS_MIN, splats.max())]
+    large: F64 = octaves[splats >= min(_CLASS_SPLATS_MIN, int(splats.max()))]
     return large[np.argsort((integers * large).sum(axis=1), kind="stable")]
 
 

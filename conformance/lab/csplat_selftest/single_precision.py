@@ -229,8 +229,8 @@ def main() -> int:
             kept = (exact == 0) | (np.abs(exact) >= _SMALLEST)
             distances = np.abs(values[kept].astype(np.float64) - exact[kept])
             old = farthest.setdefault(name, {}).get(accuracy, (0, 0.0))
-            apart = ulps_between(values[kept], exact[kept]).max(initial=0)
-            farthest[name][accuracy] = max(old[0], apart), max(old[1], distances.max(initial=0.0))
+            apart = int(ulps_between(values[kept], exact[kept]).max(initial=0))
+            farthest[name][accuracy] = max(old[0], apart), max(old[1], float(distances.max(initial=0.0)))
     sys.stdout.write(_table(farthest) + "\n")
     return 0
 
