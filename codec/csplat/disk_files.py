@@ -43,6 +43,8 @@ FOLDER_NAMES = ("meta.json", "lod-meta.json")
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
 _INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer integers exceed float64
+_DEPTH_MAX = 500  # nested brackets in JSON; half of Python's default limit of recursion
+_NO_BRACKETS = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|[^][{}"]+', re.DOTALL)  # what surrounds brackets in JSON
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -128,21 +130,28 @@ def parse_json(text: str | bytes) -> Any:
         The value.
 
     Raises:
-        InputError: it is not JSON, nested too deep, or has an integer of more than 300 digits, or a string that is not
-            text (half of a surrogate pair).
+        InputError: it is not JSON, nested more than 500 deep, or has an integer of more than 300 digits, or a string
+            that is not text (half of a surrogate pair).
     """
     try:
         text = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
+        if _json_depth(text) > _DEPTH_MAX:
+            raise InputError("its brackets are nested too deep")
         value = json.loads(text, parse_int=_parse_integer)
         if _SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise InputError("a string has half of a surrogate pair, expected Unicode text") from None
-    except RecursionError:
-        raise InputError("its brackets are nested too deep") from None
     except ValueError as error:
         raise InputError(" ".join(str(error).split())[:120]) from None
     return value
+
+
+def _json_depth(text: str) -> int:
+    """Return how deep the brackets of a JSON text are nested. The parser's own limit differs between Pythons."""
+    brackets = _NO_BRACKETS.sub("", text).translate({ord("{"): "[", ord("}"): "]"}).encode()
+    steps = np.where(np.frombuffer(brackets, "u1") == ord("["), 1, -1)
+    return int(steps.cumsum().max(initial=0))
 
 
 def _parse_integer(digits: str) -> int:
@@ -318,7 +327,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekabl
 
     Args:
         path: path of the file to write.
-        seekable: the caller seeks; a pipe receives the bytes when they are complete.
+        seekable: the caller seeks; a device or pipe receives the bytes when they are complete.
         replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
@@ -330,10 +339,10 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekabl
     """
     if Path(path).exists() and not Path(path).is_file():  # not resolved: /dev/stdout may point to an unnamed pipe
         with open_binary(path, "w") as stream:
-            if not seekable or stream.seekable():
+            if not seekable:
                 yield stream
                 return
-            with temporary_file() as spool:
+            with temporary_file() as spool:  # the null device says that it can seek, and is always at 0
                 yield spool
                 spool.seek(0)
                 shutil.copyfileobj(spool, stream, _PART_SIZE)

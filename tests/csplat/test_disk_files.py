@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 
@@ -31,6 +32,7 @@ def test_arrays_are_read_and_refused_unless_they_fit_their_file(tmp_path):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("[" * 100_000, "nested too deep"),
+    ('{"a": [' * 251 + "]}" * 251, "nested too deep"),
     ("1" * 5000, "an integer has 5,000 digits, expected at most 300"),
     ('{"a": -%s}' % ("1" * 400), "an integer has 401 digits"),
     (r'["\ud800"]', "half of a surrogate pair"),
@@ -41,6 +43,11 @@ def test_arrays_are_read_and_refused_unless_they_fit_their_file(tmp_path):
 def test_json_that_python_accepts_or_fails_on_is_refused(text, message):
     with pytest.raises(InputError, match=message):
         parse_json(text)
+
+
+def test_brackets_of_json_count_outside_strings_alone():
+    text = "[" * 500 + r'"[{\"[", "' + "[" * 1000 + '"' + "]" * 500
+    assert text == json.dumps(parse_json(text))
 
 
 def test_json_is_parsed_in_each_encoding():

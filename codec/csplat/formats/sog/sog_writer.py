@@ -67,7 +67,7 @@ def write_sog(path: Path, scene: Scene) -> list[Finding]:
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
             return losses.findings(scene.metadata)
-        with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
+        with atomic_writer(path, seekable=True) as stream, zipfile.ZipFile(stream, "w") as archive:
             for name, data in encode_files(ordered, losses):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
     return losses.findings(scene.metadata)
