@@ -49,7 +49,8 @@ def main() -> None:
         if interrupts and end.code == _OF_SIGNAL + signal.SIGINT:
             sys.exit(_OF_SIGNAL + interrupts[0])
         raise
-    sys.stderr.write("interrupted\n")
+    with suppress(OSError):
+        os.write(sys.stderr.fileno(), b"interrupted\n")
     sys.exit(_OF_SIGNAL + (interrupts or [signal.SIGINT])[0])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import sys
 import threading
@@ -68,8 +69,17 @@ def print_json(value: Any) -> None:
 
 def note(text: str) -> None:
     """Print a message on standard error, if it can be written."""
-    with suppress(OSError):
+    try:
         _echo(text, sys.stderr)
+        sys.stderr.flush()
+    except OSError:
+        drop_stream(sys.stderr)
+
+
+def drop_stream(stream: TextIO) -> None:
+    """Redirect a standard stream to the null device, so that the interpreter's flush at exit cannot fail."""
+    with suppress(OSError, ValueError):  # the stream is not a file here
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class RunProgress(Protocol):

@@ -17,7 +17,7 @@ import typer
 from csplat.disk_files import is_temporary, temporary_root
 from csplat.errors import CsplatError, InputError, LimitError
 from csplat.file_source import named_errors
-from csplat_tools.console import STANDARD_OUTPUT, note
+from csplat_tools.console import STANDARD_OUTPUT, drop_stream, note
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -81,11 +81,11 @@ def report_errors() -> Iterator[None]:
     except CsplatError as error:
         _fail(_describe_csplat_error(error), error.code)
     except BrokenPipeError:
-        _drop_stdout()
+        drop_stream(sys.stdout)
         raise typer.Exit(EXIT_FAILED) from None
     except OSError as error:
         if error.filename == STANDARD_OUTPUT:
-            _drop_stdout()
+            drop_stream(sys.stdout)
         _fail(_describe_os_error(error), errno.errorcode.get(error.errno or 0, ""))
     except MemoryError:
         _fail("out of memory", "")
@@ -141,11 +141,3 @@ def _describe_os_error(error: OSError) -> str:
     if number == errno.ENOENT and (url := _LOST_URL.match(name)):
         return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs"
     return f"{name}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "")
-
-
-def _drop_stdout() -> None:
-    """Redirect standard output to the null device, so that the interpreter's flush at exit cannot fail."""
-    try:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, ValueError):
-        return  # standard output is not a file here
