@@ -4,6 +4,7 @@
 Also: csplat_tools.cli.batch.
 """
 
+import errno
 import json
 import os
 import signal
@@ -156,6 +157,20 @@ def test_a_killed_process_fails_its_scene_alone_and_an_interrupt_is_not_lost(sce
     signal.signal(signal.SIGINT, before)
 
 
+def open_when_read(pipe, process, seconds=60):
+    """Open a named pipe when another process reads it, or fail; `open` would wait for ever."""
+    for _ in range(10 * seconds):
+        try:
+            return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO:
+                raise
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.1)
+    process.kill()
+    raise AssertionError(f"nobody has read {pipe} for {seconds} s: {process.communicate()[1]}")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_an_ended_batch_leaves_no_processes_and_is_continued(scenes, tmp_path, number):
@@ -163,9 +178,10 @@ def test_an_ended_batch_leaves_no_processes_and_is_continued(scenes, tmp_path, n
     os.mkfifo(stuck)  # without a size it comes last
     line = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "2"]
     running = subprocess.Popen(line, stderr=subprocess.PIPE, text=True)
-    with stuck.open("wb"):  # waits for a worker to read it
-        running.send_signal(number)
-        error = running.communicate(timeout=60)[1]  # its processes have the same pipe
+    end = open_when_read(stuck, running)
+    running.send_signal(number)
+    error = running.communicate(timeout=60)[1]  # its processes have the same pipe
+    os.close(end)
     assert (-number if number == signal.SIGKILL else 128 + number) == running.returncode
     assert ("Traceback" in error, []) == (False, list(out.rglob(".*")))
     stuck.unlink()

@@ -59,7 +59,14 @@ def project(tmp_path, monkeypatch):
     )
 
 
+@pytest.fixture
+def compiler(project):
+    """A compiler; a machine without one lends pip that of a package, in an environment that pip removes."""
+    return project.build.compiler() or pytest.skip("compiles, by a C++ compiler or the package ziglang")
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiler")
 def test_a_library_is_compiled_when_its_sources_change(project):
     files = project.build.build()
     assert [] == project.build.requirements()
@@ -75,6 +82,7 @@ def test_a_library_is_compiled_when_its_sources_change(project):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiler")
 def test_a_library_exports_its_functions_alone(project):
     nm = shutil.which("nm")
     if nm is None or sys.platform != "linux":
@@ -85,6 +93,7 @@ def test_a_library_exports_its_functions_alone(project):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiler")
 def test_the_wheel_with_the_library_serves_every_python_of_its_platform(project):
     project.hook.initialize("standard", project.data)
     assert project.data["tag"] == f"py3-none-{project.build.wheel_platform()}"
