@@ -43,7 +43,7 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 check: $(VENV)/.dev native ## half a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
 	tests/run.sh check
 
-test: $(VENV)/.dev native ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
+test: $(VENV)/.dev native ## everything that an ordinary change can break, on the built wheel
 	tests/run.sh test
 
 lab-test: $(VENV)/.dev native ## the laboratories: authoring, planted faults, fuzzing, benchmarks
@@ -60,11 +60,8 @@ native: | $(BIN)/python ## compile the library of the renderer, if its sources h
 	@needed=$$($(BIN)/python $(NATIVE) --requires) && { [ -z "$$needed" ] || $(INSTALL) "$$needed"; }
 	@$(BIN)/python $(NATIVE) >/dev/null
 
-lint: $(VENV)/.dev ## style, types and import contracts alone
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+lint: $(VENV)/.dev ## style, types, import contracts and generated files, of Python and JavaScript
+	tests/run.sh lint
 
 format: $(VENV)/.dev ## bring the code into its one layout
 	$(BIN)/ruff check --fix .

@@ -1,15 +1,17 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
-# The tiers of tests; `make check`, `make test`, `make lab-test` and `make test-all` set up .venv and call this.
+# The tiers of tests; `make lint`, `make check`, `make test` and so on set up .venv and call this.
 #
-#   tests/run.sh check   the checkout: style, types, import contracts, generated files, unmarked tests; half a minute
+#   tests/run.sh lint    style, types, import contracts, generated files; these depend on the versions of their tools
+#   tests/run.sh check   the checkout: the same of Python, and unmarked tests; half a minute
 #   tests/run.sh test    the built wheel: everything that an ordinary change can break; minutes
 #   tests/run.sh lab     the laboratories: authoring, planted faults, fuzzing, benchmarks
 #   tests/run.sh part M  the tests with marker M
 #   tests/run.sh all     all of these, with every marker, pyright and long fuzzing
 #
 # Further words go to pytest. With CI=true in the environment nothing may be skipped because a program is absent.
-# Each step prints its seconds of wall time and of CPU time, children included; a table at the end repeats them.
+# A step that fails stops no other one. Each prints its seconds of wall time and of CPU time, children included; a table
+# at the end repeats them, and says what failed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -35,12 +37,12 @@ check_tier() {
 # test_tier EXPRESSION [WORDS...]: EXPRESSION selects tests by their markers.
 test_tier() {
     step "wheel" build_wheel
+    [ -z "$FAILED" ] || finish
     use_wheel
     # Meanwhile other steps use the other core.
     background "behaviour snapshot" "$BIN/python" -m pytest -q tests/system/test_behaviour.py -m "$1"
-    static_checks
     step "vectors equal their recipes" "$BIN/python" -m csplat_authoring --check
-    javascript
+    ! have node "the JavaScript tests" || step "JavaScript" javascript_tests
     # By the command, as an author of a decoder or encoder runs it; tests run every level and input in their own process.
     step "conformance of the decoder" "$BIN/csplat" conformance decoder --level 4
     step "conformance of the encoder" "$BIN/csplat" conformance encoder --level 3 --filter '*/duplicates'
@@ -56,6 +58,8 @@ lab_tier() {
 
 all_tier() {
     step "types (pyright)" "$BIN/pyright"
+    static_checks
+    javascript_checks
     test_tier "" "$@"
     lab_tier 1500
 }
@@ -68,40 +72,49 @@ static_checks() {
     step "generated files" "$BIN/python" spec/generate.py --check
 }
 
-javascript() {
-    have node "the JavaScript tests" || return 0
-    if have npm "types and layout of the JavaScript"; then
-        [ node_modules/.package-lock.json -nt package-lock.json ] ||
-            step "npm packages" npm ci --silent --no-audit --no-fund --ignore-scripts
-        step "types (tsc)" npm run --silent types
-        step "layout (prettier)" npm run --silent format:check
-    fi
-    step "JavaScript" javascript_tests
+javascript_checks() {
+    have npm "types and layout of the JavaScript" || return 0
+    [ node_modules/.package-lock.json -nt package-lock.json ] ||
+        step "npm packages" npm ci --silent --no-audit --no-fund --ignore-scripts
+    step "types (tsc)" npm run --silent types
+    step "layout (prettier)" npm run --silent format:check
 }
 
 SUMMARY=""
+FAILED=""
 
 # step NAME COMMAND...: run it in a subshell, whose CPU time is that of this step alone, even while others run.
 step() {
+    local status=0
     printf '\n== %s\n' "$1"
-    (timed out/step.seconds "${@:2}")
-    noted "$1" out/step.seconds
+    (timed out/step.seconds "${@:2}") || status=$?
+    noted "$1" out/step.seconds $status
 }
 
 # timed FILE COMMAND...: write the seconds of wall and of CPU time that a command took; for a subshell of its own.
 timed() {
-    local began=$SECONDS
-    "${@:2}"
+    local began=$SECONDS status=0
+    "${@:2}" || status=$?
     cpu_seconds
     echo "$((SECONDS - began)) $CPU" >"$1"
+    return $status
 }
 
-# noted NAME FILE: print the seconds of a step, and keep them for the table.
+# noted NAME FILE STATUS: print the seconds of a step, and keep them and its failure for the end.
 noted() {
     local wall cpu
     read -r wall cpu <"$2"
     printf -- '-- %d s, CPU %d s\n' "$wall" "$cpu"
     SUMMARY+=$(printf '%-28s %5d %5d' "$1" "$wall" "$cpu")$'\n'
+    [ "$3" = 0 ] || FAILED+="  $1"$'\n'
+}
+
+# Print the table, and exit with status 1 if a step failed.
+finish() {
+    cpu_seconds
+    printf '\n%-28s %5s %5s\n%s%-28s %5d %5d\n' step wall CPU "$SUMMARY" "$TIER" $((SECONDS - BEGAN)) "$CPU"
+    [ -z "$FAILED" ] || { printf '\nfailed:\n%s' "$FAILED" && exit 1; }
+    exit 0
 }
 
 # Set CPU to the CPU seconds of this shell and of all its children that have ended.
@@ -124,8 +137,7 @@ joined() {
     wait "$BACKGROUND" || status=$?
     printf '\n== %s\n' "$BACKGROUND_NAME"
     cat out/background.log
-    [ $status = 0 ] || exit $status
-    noted "$BACKGROUND_NAME" out/background.seconds
+    noted "$BACKGROUND_NAME" out/background.seconds $status
 }
 
 # have PROGRAM WHAT: false, with one loud line, if WHAT must be skipped; a failure if CI=true.
@@ -170,15 +182,15 @@ unset PYTHONDONTWRITEBYTECODE # many tests start processes: what one of them has
 mkdir -p out
 BEGAN=$SECONDS
 case $TIER in
+lint) static_checks && javascript_checks ;;
 check) check_tier "$@" ;;
 test) test_tier "$EVERYDAY" "$@" ;;
 lab) lab_tier 200 "$@" ;;
 part) step "marker $1" "${PYTEST[@]}" -m "$1" "${@:2}" ;;
 all) all_tier "$@" ;;
 *)
-    echo "usage: tests/run.sh check|test|lab|part|all [words for pytest]" >&2
+    echo "usage: tests/run.sh lint|check|test|lab|part|all [words for pytest]" >&2
     exit 2
     ;;
 esac
-cpu_seconds
-printf '\n%-28s %5s %5s\n%s%-28s %5d %5d\n' step wall CPU "$SUMMARY" "$TIER" $((SECONDS - BEGAN)) "$CPU"
+finish
