@@ -142,14 +142,14 @@ def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     assert {"index.html", "one.csplat"} == {path.name for path in (tmp_path / "encoded").iterdir()}
 
 
-@pytest.mark.long
-def test_the_python_example_with_a_target_runs(sample_path, tmp_path, monkeypatch, capsys):
+@pytest.mark.slow
+def test_the_python_example_with_levels_runs(sample_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    csplat.write("scene.ply", csplat.read(sample_path).select(range(200)))
+    csplat.write("scene.ply", csplat.read(sample_path))
     names = {}
     for program in blocks(README, "python"):
         exec(program, names)  # noqa: S102  # the README's own lines
-    assert 0 < len(names["coarse"]) <= 200
+    assert 0 < len(names["coarse"]) <= 5000
     assert 37.5 < float(capsys.readouterr().out.split()[0]) < 60.0
 
 
