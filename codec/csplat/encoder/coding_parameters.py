@@ -260,7 +260,8 @@ def contrast_sums(part: SplatModel) -> tuple[float, float]:
 def contrast_of(parts: Iterable[tuple[float, float]]) -> float:
     """Return the contrast of a scene from the `contrast_sums` of parts of it, in their order."""
     sums = list(parts)
-    return _contrast(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
+    # sum rounds otherwise from Python 3.12 on.
+    return _contrast(math.fsum(squares for squares, _ in sums), math.fsum(weights for _, weights in sums))
 
 
 @dataclass(frozen=True)

@@ -334,7 +334,7 @@ def _shape_input(
     n = np.rint(np.where(fits, scales, 0.0).astype(np.float64) / parameters.scale_step).astype(np.int64)
     q = quat_levels(rotation, parameters.quat_levels)
     decoded, decoded_sizes = unit_covariances(quat_values(q, parameters.quat_levels), n * parameters.scale_step)
-    bits = sum(_entropy(column[fits]) for column in (*n, *q))
+    bits = math.fsum(_entropy(column[fits]) for column in (*n, *q))
     plain = _shape_errors(covariances, decoded, decoded_sizes - sizes, weights, metric)
     return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 

@@ -118,7 +118,11 @@ def _camera(
     right = _unit(_cross((0.0, 1.0, 0.0), forward))
     rows = (right, _cross(forward, right), forward)
     viewmat = [
-        [*(round(value, 9) for value in row), round(-sum(r * p for r, p in zip(row, position, strict=True)), 9)]
+        # By fsum, since sum rounds otherwise from Python 3.12 on; without a zero's sign, which depends on the rounding.
+        [
+            *(round(value, 9) for value in row),
+            0.0 - round(math.fsum(r * p for r, p in zip(row, position, strict=True)), 9),
+        ]
         for row in rows
     ]
     return {
@@ -131,7 +135,7 @@ def _camera(
 
 
 def _unit(v: tuple[float, ...]) -> tuple[float, ...]:
-    length = math.sqrt(sum(x * x for x in v))
+    length = math.sqrt(math.fsum(x * x for x in v))
     return tuple(x / length for x in v)
 
 
