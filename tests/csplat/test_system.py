@@ -5,6 +5,7 @@ import mmap
 import multiprocessing
 import operator
 import os
+import shlex
 import signal
 import sys
 import time
@@ -137,9 +138,10 @@ def test_command_lines_of_windows_keep_their_backslashes():
 @pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_programs_end_or_are_killed_without_process_groups():
-    ended = run_program(f"{sys.executable} -S -c 'print(5)'", {}, 20)
+    python = shlex.quote(sys.executable)
+    ended = run_program(f"{python} -S -c 'print(5)'", {}, 20)
     assert (None, b"5\n") == (ended.status, ended.stdout)
-    assert run_program(f"{sys.executable} -S -c 'import time; time.sleep(60)'", {}, 0.3).status is Status.HUNG
+    assert run_program(f"{python} -S -c 'import time; time.sleep(60)'", {}, 0.3).status is Status.HUNG
 
 
 def test_interrupts_are_held_back_if_the_system_can(monkeypatch):

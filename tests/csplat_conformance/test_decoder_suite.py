@@ -103,8 +103,15 @@ PAYLOADS = ("invalid/json_open", "invalid/json_surrogate", "invalid/json_beyond_
 RECORDED = ("valid/quats", "invalid/quat_radicand", *PAYLOADS)
 
 ROOT = Path(__file__).resolve().parents[2]
-ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
-CUT_ADAPTER = f"{sys.executable} -m csplat_conformance.adapter --cuts {{input}} {{cuts}}"
+ADAPTER = f"{shlex.quote(sys.executable)} -m csplat_conformance.adapter {{input}} {{outdir}}"
+CUT_ADAPTER = f"{shlex.quote(sys.executable)} -m csplat_conformance.adapter --cuts {{input}} {{cuts}}"
+
+
+def script(path, word):
+    """Return the command line of a script that needs the standard library alone, which starts quickly."""
+    return shlex.join([sys.executable, "-I", "-S", str(path), word])
+
+
 JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 
@@ -133,7 +140,7 @@ def faulty(recorded):
     """Return a function for a run of our decoder with a fault, on vectors of some names."""
 
     def run(fault, pattern="valid/quats", **options):
-        command = f"{sys.executable} -I -S {recorded / 'decoder.py'} '{fault}' {{input}} {{outdir}}"
+        command = f"{script(recorded / 'decoder.py', fault)} {{input}} {{outdir}}"
         return run_command(command, DecoderSuiteOptions(pattern=pattern, **options))
 
     return run
@@ -142,7 +149,7 @@ def faulty(recorded):
 @pytest.fixture(scope="module")
 def faulty_cuts(recorded):
     """Return a function for the command line of a program for cuts that prints the lines of an expression."""
-    return lambda lines: f"{sys.executable} -I -S {recorded / 'cuts.py'} {shlex.quote(lines)} {{input}} {{cuts}}"
+    return lambda lines: f"{script(recorded / 'cuts.py', lines)} {{input}} {{cuts}}"
 
 
 @pytest.mark.slow
@@ -448,7 +455,7 @@ def invoke(*words):
 
 @pytest.mark.slow
 def test_the_command_writes_table_json_and_junit(recorded, tmp_path):
-    command = f"{sys.executable} -I -S {recorded / 'decoder.py'} rounding {{input}} {{outdir}}"
+    command = f"{script(recorded / 'decoder.py', 'rounding')} {{input}} {{outdir}}"
     quats, reports = ("--filter", "valid/quats"), ("--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
     result = invoke("--cmd", command, *quats, *reports)
     assert 1 == result.exit_code

@@ -2,6 +2,7 @@
 """L4: reference pictures, and renderers within and beyond the tolerance."""
 
 import json
+import shlex
 import sys
 
 import numpy as np
@@ -55,7 +56,7 @@ def copier(tmp_path_factory):
             (folder / f"{fault}.{number}.png").write_bytes(write_png(np.ascontiguousarray(change(picture))))
     script = folder / "renderer.py"
     script.write_text(COPIER)
-    return lambda fault: f"{sys.executable} -I -S {script} {fault} {{input}} {{camera}} {{out}}"
+    return lambda fault: f"{shlex.join([sys.executable, '-I', '-S', str(script)])} {fault} {{input}} {{camera}} {{out}}"
 
 
 def test_a_scene_is_seen_by_two_cameras_of_a_camera_file_and_not_dark():

@@ -260,8 +260,8 @@ def test_ctrl_c_leaves_a_checkpoint_beside_the_output_from_which_the_run_ends_as
 @pytest.mark.slow
 def test_one_training_gives_several_files(file_runs):
     trained, usual = file_runs.checkpoint.read_bytes(), file_runs.report["file"]
-    resume = f"`--resume {file_runs.checkpoint} --target-size …` makes other sizes"
-    assert f"`csplat view {file_runs.folder / 'a.csplat'}` shows it; {resume}\n" in file_runs.messages
+    resume = f"`--resume {shlex.quote(str(file_runs.checkpoint))} --target-size …` makes other sizes"
+    assert f"`csplat view {shlex.quote(str(file_runs.folder / 'a.csplat'))}` shows it; {resume}\n" in file_runs.messages
 
     def made(name, *more, **options):
         return file_runs.made(name, "--resume", file_runs.checkpoint, *more, **options)[0]["file"]

@@ -3,6 +3,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from contextlib import contextmanager
@@ -87,7 +88,7 @@ def test_passes_the_conformance_suite(tmp_path, sources, choice, least):
 def test_selects_the_tiles_of_cuts(decoder, tmp_path):
     adapter = compiled(tmp_path, "adapter", decoder, ADAPTER)
     options = DecoderSuiteOptions("valid/levels*,extreme/levels*", levels=(5,))
-    report = run_command(None, options, cuts=f"{adapter} --cuts {{input}} {{cuts}}")
+    report = run_command(None, options, cuts=f"{shlex.quote(str(adapter))} --cuts {{input}} {{cuts}}")
     assert [] == report.failures
     assert len(report.outcomes) > 10
 

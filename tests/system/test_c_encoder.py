@@ -2,6 +2,7 @@
 """The encoder in C: it writes the integers of the preset `fast`, passes the encoder suite, and refuses bad input."""
 
 import ctypes
+import shlex
 import zlib
 from dataclasses import replace
 from typing import ClassVar
@@ -249,7 +250,8 @@ def test_uses_the_functions_of_the_caller_and_survives_their_failures(library, s
 
 
 def test_passes_the_encoder_suite(tool):
-    report = run_encoder(f"{tool} {{ply}} {{out}} {{index}}", EncoderSuiteOptions(levels=("L1", "L2", "L3"), jobs=2))
+    command = f"{shlex.quote(str(tool))} {{ply}} {{out}} {{index}}"
+    report = run_encoder(command, EncoderSuiteOptions(levels=("L1", "L2", "L3"), jobs=2))
     assert [] == report.failures
     declined = [outcome.name for outcome in report.outcomes if outcome.status == "declined"]
     assert ["nasty/degree_5"] == declined

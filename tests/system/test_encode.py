@@ -62,8 +62,7 @@ COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}
 
 
 @pytest.mark.slow
-def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
+def test_every_command_has_the_five_common_options_and_help_for_all():
     group, count = get_command(app), 0
     for name in group.list_commands(None):
         one = group.get_command(None, name)

@@ -198,7 +198,7 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
 
     def run(words):
         made.clear()
-        given = words.replace("PLY", str(ply)).replace("OUT", str(tmp_path)).split()
+        given = [word.replace("PLY", str(ply)).replace("OUT", str(tmp_path)) for word in words.split()]
         result = json.loads(call(*given, "--data", data, "--json").stdout)
         assert any(views.images for views in made), words
         for views in made:

@@ -8,6 +8,7 @@ csplat_trainer.tuning.tuning_options.
 import json
 import math
 import re
+import shlex
 import signal
 from dataclasses import replace
 from functools import partial
@@ -355,7 +356,7 @@ def test_a_refused_run_writes_and_replaces_nothing(capture, tmp_path, monkeypatc
         (1, "scene.ply old.csplat", "--self", "--force replaces it"),
         (1, "scene.ply a.csplat", "--self --checkpoint scene.ply --force", "is the input"),
         (1, "scene.ply a.csplat", "--data . --resume absent.npz", "absent.npz: No such file"),
-        (1, "one.ply a.csplat", f"--data {capture} --target-size 300B", "more than 300 (E_INPUT)"),
+        (1, "one.ply a.csplat", f"--data {shlex.quote(str(capture))} --target-size 300B", "more than 300 (E_INPUT)"),
         (2, "scene.ply a.csplat", "", "expected --data or --self"),
         (2, "scene.ply a.csplat", "--self --data x", "--data and --self: give one of them"),
         (2, "scene.ply a.csplat", "--data x --cameras y", "--cameras and --data: give one of them"),
@@ -365,7 +366,7 @@ def test_a_refused_run_writes_and_replaces_nothing(capture, tmp_path, monkeypatc
         (2, "scene.ply a.csplat", "--self --keep 0.5 --target-size 1MB", "--target-size and --keep: give one of"),
         (2, "scene.ply a.csplat", "--self --lambda 2", "lambda is 2.0, expected 0 to 1"),
     ):
-        result = invoke("finetune", *files.split(), *words.split(), *BRIEF)
+        result = invoke("finetune", *files.split(), *shlex.split(words), *BRIEF)
         assert status == result.exit_code, words
         assert message in " ".join(result.stderr.replace("│", " ").split())
         assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
