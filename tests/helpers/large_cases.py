@@ -30,8 +30,8 @@ class EveryFourth:
     def settings(self, count):
         return {"splats": f"every fourth of {count}"}
 
-    def seconds(self, count):
-        return 1e-5 * count
+    def seconds(self, count, workers):
+        return 1e-5 * count / workers
 
     def of_scene(self, sample, count):
         assert 0 < len(sample) <= count == COUNT

@@ -47,11 +47,15 @@ from csplat_tools.planned_progress import Plan, PlannedProgress, PlannedWork
 
 _KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
-# Seconds per splat to build levels and measure their errors, of SH degree 3: scenes in one piece on two threads, and
-# buckets on one thread.
-_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 1e-4, 7e-5, 1.8e-5
-# Costs of each report for a splat, in the unit of plans: of buckets, and of coding and measuring levels.
-_BUILDING_COST, _CODING_COST = 8000.0, 100.0
+# CPU seconds to fit levels of a scene of a million splats in one piece and measure their errors, the power of its size
+# that they grow with, since the work on a level is bounded, and the fraction that threads do not share. Four scenes of
+# 60,000 to 1,136,356 splats of SH degree 3 took 0.8 to 1.1 times of it.
+_SECONDS_WHOLE, _WHOLE_EXPONENT, _SERIAL = 235.0, 0.55, 0.25
+# CPU seconds per splat for levels of buckets, fitted, and of any scene, merged, of which threads share hardly anything.
+_SECONDS_FITTED, _SECONDS_MERGED = 9e-5, 2.4e-5
+# Costs of each report for a splat, in the unit of plans: of buckets, of merging, and of coding and measuring levels.
+_BUILDING_COST, _MERGING_COST, _CODING_COST = 8000.0, 500.0, 100.0
+_MERGING = "merging splats of level {}"  # name of a stage
 _QUICK_NEIGHBOURS = 4  # without a fit; 8 gain 0 to 0.4 dB at level 1 (lego60k, garden500k)
 #: Of scenes that are built bucket by bucket, except the largest, whose upper levels would be too large to be built at
 #: once: with it, the index of 10 million splats has 56 kB instead of 114 kB.
@@ -105,10 +109,14 @@ class FittedLevelBuilder:
         made = "fitted" if self._is_fitted(count) else "merged"
         return {"splats": made, "leaf_splats": self.leaf_splats, **size}
 
-    def seconds(self, count: int) -> float:
-        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
-        fitted = _SECONDS_WHOLE if count <= self.whole_splats else _SECONDS_FITTED
-        return count * (fitted if self._is_fitted(count) else _SECONDS_MERGED)
+    def seconds(self, count: int, workers: int) -> float:
+        """Return the approximate time for the levels of a scene of `count` splats, as in `LevelBuilder`."""
+        is_fitted = self._is_fitted(count)
+        if count > self.whole_splats:
+            return count * (_SECONDS_FITTED if is_fitted else _SECONDS_MERGED) / workers
+        if not is_fitted:
+            return count * _SECONDS_MERGED
+        return _SECONDS_WHOLE * math.pow(count / 1e6, _WHOLE_EXPONENT) * (_SERIAL + (1.0 - _SERIAL) / workers)
 
     def _is_fitted(self, count: int) -> bool:
         """Return True if the levels of a scene of `count` splats, or of its buckets, are fitted to renders."""
@@ -140,7 +148,7 @@ class FittedLevelBuilder:
             from csplat_tools.level_fitting import LevelFitter
 
             scene = _plain(model)
-            fit = LevelFitter(scene, coding=coding, context=context).fit if self.fits else _merge_only
+            fit = LevelFitter(scene, coding=coding, context=context).fit if self.fits else _merger(context)
             with thread_count(context.threads):
                 return self._build_leaves(scene, fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
@@ -175,7 +183,7 @@ class FittedLevelBuilder:
         from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
         splats = _plain(splats)
-        fit: _Fit = _merge_only
+        fit = _merger(context)
         if self.backdrop is not None:
             fit = LevelFitter(splats, self.backdrop, work=PART_WORK, coding=coding, context=context).fit
         with thread_count(context.threads):
@@ -202,9 +210,9 @@ class FittedLevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        fitter = LevelFitter(scene, coding=coding, context=context)
+        fit = LevelFitter(scene, coding=coding, context=context).fit if self.fits else _merger(context)
         with thread_count(context.threads):
-            nodes = self._add_levels(nodes, scene, places, fitter.fit if self.fits else _merge_only, self.count)
+            nodes = self._add_levels(nodes, scene, places, fit, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -225,7 +233,8 @@ class FittedLevelBuilder:
         elif self.nodes is None and count:
             while count > self.root_splats if self.count is None else level < self.count:
                 finer_count, count, level = count, math.ceil(count / _KEPT), level + 1
-                phases.append(LevelFitter(model).plan(finer_count, count, level))
+                merging = {_MERGING.format(level): PlannedWork(1, finer_count * _MERGING_COST)}
+                phases.append(LevelFitter(model).plan(finer_count, count, level) if self.fits else merging)
         per_stage = _CODING_COST * len(model)
         return [
             *phases,
@@ -329,11 +338,17 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
     return np.split(order, np.cumsum(sizes)[:-1])
 
 
-def _merge_only(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
-    """Make the splats of a level as `LevelFitter.fit` does, by merging alone, in 0.6 of its time for merging."""
+def _merger(context: Context) -> _Fit:
+    """Return a function that makes levels as `LevelFitter.fit` does, by merging alone, in 0.6 of its time to merge."""
     from csplat_tools.level_merging import merge_neighbours
 
-    return merge_neighbours(finer, nodes, count, _QUICK_NEIGHBOURS)
+    def merge(finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
+        context.progress(_MERGING.format(level), 0.0)
+        merged = merge_neighbours(finer, nodes, count, _QUICK_NEIGHBOURS)
+        context.progress(_MERGING.format(level), 1.0)
+        return merged
+
+    return merge
 
 
 def _plain(model: SplatModel) -> SplatModel:

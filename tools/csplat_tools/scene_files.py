@@ -237,9 +237,9 @@ def sample_scene(
     every = max(1, -(-scene.count // splats_max))
     parts = []
     for rows, block in scene.numbered():
-        if progress is not None:
-            progress("sampling the scene", rows.start / max(1, scene.count))
         parts.append(_plain(block.select(np.arange(-rows.start % every, len(block), every))))
+        if progress is not None:
+            progress("sampling the scene", rows.stop / scene.count)
     return join_blocks(_plain(scene.empty()), parts), every
 
 

@@ -128,8 +128,13 @@ class LevelBuilder(Protocol):
         """Return the value of `levels` in the OPTS chunk of a scene of `count` splats, JSON-compatible."""
         ...
 
-    def seconds(self, count: int) -> float:
-        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
+    def seconds(self, count: int, workers: int) -> float:
+        """Return the approximate time for the levels of a scene of `count` splats.
+
+        Args:
+            count: number of splats.
+            workers: number of threads for a scene built in one piece, of processes for a larger one.
+        """
         ...
 
     def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:

@@ -146,7 +146,7 @@ def estimate_cost(
     seconds = count / 1e6 * (read * passes + code / workers) + book * min(1.0, count / _CODEBOOK_SPLATS) / workers
     file_bytes = round(count * _FILE_BYTES[options.preset][degree])
     if levels is not None:
-        seconds += levels.seconds(count) / (1 if is_whole else workers)
+        seconds += levels.seconds(count, workers)
         file_bytes = round(file_bytes * _LEVEL_SIZE)
     return EncodingCost(count, degree, in_memory, workers, memory, disk, seconds, file_bytes)
 

@@ -176,9 +176,10 @@ def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
 
 
 def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_both, model, sample_path):
+    reports = []
     with open_scenes(files_of_both[:2], Context(memory=LITTLE)) as (source, _):
-        found, every = sample_scene(source, splats_max=220)
-    assert (7, 0) == (every, found.sh_degree)
+        found, every = sample_scene(source, splats_max=220, progress=lambda _, done: reports.append(done))
+    assert (7, 0, 1.0) == (every, found.sh_degree, reports[-1])
     np.testing.assert_array_equal(model.means[::7], found.means)
     whole = read_ply(sample_path)
     part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
