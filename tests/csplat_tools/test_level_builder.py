@@ -333,9 +333,9 @@ def test_encode_writes_levels(tmp_path, model):
     assert_valid(out.read_bytes())
     assert {0, 1, 2} == {tile.level for tile in read_header(out.read_bytes()).all_tiles}
     assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
-    for word in ("17", "none", "0", "-1"):
+    for word in ("17", "all", "0", "-1"):
         refused = call("encode", source, out, "--force", f"--levels={word}", status=2)
-        assert "expected auto, merged or 1 to 16" in " ".join(refused.output.split())
+        assert "expected auto, merged, 1 to 16 or none" in " ".join(refused.output.split())
 
 
 @pytest.mark.slow

@@ -18,19 +18,21 @@ import subprocess
 import sys
 import tempfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command_line import PROGRAM, invoke, printed, refused, status_of
+from command_line import PROGRAM, call, invoke, printed, refused, status_of
 from typer.main import get_command
 
 import csplat
 from csplat import Context, decode, write_ply
 from csplat.ply import read_ply
 from csplat_tools.cli.app import app
-from csplat_tools.encode_file import encode_file
+from csplat_tools.encode_file import describe_first_picture, encode_file
+from csplat_tools.present.viewer_server import SceneServer
 
 pytestmark = pytest.mark.usefixtures("no_first_view")
 
@@ -475,14 +477,33 @@ def test_a_large_scene_needs_little_memory_unless_levels_are_requested(make_mode
     def estimate(*more):
         done = invoke("encode", large, "--dry-run", "--json", "--memory", *more)
         assert 0 == done.exit_code, done.output
-        return json.loads(done.stdout), done.stderr
+        return json.loads(done.stdout)
 
-    small, said = estimate("500MB")
-    assert 400_000_000 < small["memory_bytes"] <= 500_000_000
-    assert "levels" not in said  # they do not fit
-    (cost, said), (more, nothing) = estimate("8GB"), estimate("8GB", "--levels", "auto")
+    assert 400_000_000 < estimate("500MB")["memory_bytes"] <= 500_000_000
+    cost, more = estimate("8GB"), estimate("8GB", "--levels", "auto")
     assert 1.35 == pytest.approx(more["file_bytes"] / cost["file_bytes"], abs=0.001)
     assert more["seconds"] > cost["seconds"]
-    assert "sooner with levels of detail: --levels auto" in said
-    assert said.endswith(" more, 35 % more bytes)\n")
-    assert "levels of detail" not in nothing + estimate("8GB", "--quiet")[1]
+    assert cost == estimate("8GB", "--levels", "none")
+
+
+def test_a_first_picture_that_takes_long_is_reported_with_a_remedy(tmp_path, ply, monkeypatch):
+    out, page = tmp_path / "a.csplat", tmp_path / "a.html"
+    short = csplat.read_header(csplat.encode(read_ply(ply)))
+    header = replace(short, index_size=6_000_000)
+    for found in (short, replace(header, coarse_tiles=header.tiles), replace(header, index_size=4_900_000)):
+        assert [] == describe_first_picture(found)
+    (line,), (page_line,) = describe_first_picture(header), describe_first_picture(short, 7_000_000)
+    assert line.startswith("the first picture takes 6.0 MB, 5 s at 10 Mbit/s; levels of detail avoid this (")
+    assert "takes 7.0 MB, 6 s at 10 Mbit/s; levels of detail in a page with `csplat export-element` avoid" in page_line
+    (line,) = describe_first_picture(replace(header, resource_level="B"))
+    assert "10 Mbit/s, and phones may refuse the file (resource level B); levels" in line
+
+    monkeypatch.setattr(SceneServer, "serve_forever", lambda *_, **__: None)
+    for module in ("encode", "view"):
+        monkeypatch.setattr(f"csplat_tools.cli.{module}.describe_first_picture", lambda *_: ["a long wait"])
+    for words in (("encode", ply, out), ("view", out, "--no-browser"), ("export-html", out, page)):
+        done = call(*words, "--json")
+        assert "a long wait" in done.stderr.splitlines()
+        assert "a long wait" not in done.stdout
+        if words[0] != "view":
+            assert "" == call(*words, "--force", "--quiet").stderr

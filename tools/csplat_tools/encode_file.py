@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import csplat
-from csplat._spec import MEASURE_NAMES
+from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.decoder import SceneHeader
 from csplat.disk_files import size_on_disk
 from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, EncodeResult, Target, Views
@@ -27,7 +28,8 @@ from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_le
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_source, with_first_view
 
 _PLY_FACTOR = 8  # memory of an encoding divided by the size of its PLY, at most; 3 for float32 columns, more for bytes
-_MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
+_LINE_MBITS = 10  # Mbit/s, of the slow line that our measurements use (docs/results/speed.md)
+_SLOW_SECONDS = 4.0  # from which Web Vitals call the time to the largest content of a page poor (web.dev/articles/lcp)
 _CUT = "the dropped SH bands are cut off: projecting them onto the others requires the scene in memory, without bounds"
 
 
@@ -40,26 +42,29 @@ def read_degree(options: EncodeOptions) -> int | None:
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
 
-def describe_levels(scene: Scene, options: EncodeOptions, context: Context = DEFAULT_CONTEXT) -> list[str]:
-    """Format the use and the cost of levels of detail as a line, for a scene that is encoded without.
+def describe_first_picture(header: SceneHeader, page_bytes: int | None = None) -> list[str]:
+    """Format the wait for the first picture of a file without levels of detail, and what levels cost, as a line.
 
     Args:
-        scene: the scene; its blocks are not read.
-        options, context: as for `encode_file`.
+        header: header of the file.
+        page_bytes: size of an exported page, all of which arrives before it shows its scene; `None`: viewers draw the
+            scene when the geometry of all tiles is here.
 
     Returns:
-        The line, in a list; nothing for fewer than a million splats, or if the levels require more memory.
+        The line, in a list; nothing if the file has levels, or its first picture does not take long.
     """
-    if scene.count < _MANY_SPLATS:
+    geometry = sum(tile.layers[_spec.LAYER_GEOMETRY].size for tile in header.tiles)
+    size = _spec.HEADER_SIZE + header.index_size + geometry if page_bytes is None else page_bytes
+    seconds, level = 8e-6 * size / _LINE_MBITS, header.resource_level
+    if header.coarse_tiles or seconds < _SLOW_SECONDS:
         return []
-    try:
-        cost = estimate_cost(scene, options, context)
-        more = estimate_cost(scene, options, context, FittedLevelBuilder(bucket_splats=options.bucket_splats))
-    except InputError:
-        return []
-    seconds, growth = more.seconds - cost.seconds, more.file_bytes / cost.file_bytes - 1.0
-    price = f"about {format_estimate(seconds)} more, {100.0 * growth:.0f} % more bytes"
-    return [f"viewers show a scene of {scene.count:,} splats sooner with levels of detail: --levels auto ({price})"]
+    is_phones = level == _spec.RESOURCE_LEVEL_NAMES[_spec.RESOURCE_LEVEL_A]
+    phones = "" if is_phones else f", and phones may refuse the file (resource level {level})"
+    place = "" if page_bytes is None else " in a page with `csplat export-element`"
+    time = format_estimate(FittedLevelBuilder(fits=False).seconds(header.splat_count, DEFAULT_CONTEXT.thread_count))
+    wait = f"the first picture takes {format_bytes(size)}, {seconds:.0f} s at {_LINE_MBITS} Mbit/s{phones}"
+    price = f"`csplat encode --levels merged`: about {time} more, a third more bytes"
+    return [f"{wait}; levels of detail{place} avoid this ({price})"]
 
 
 @dataclass(frozen=True)
@@ -263,7 +268,7 @@ def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[st
     """Format declared errors, maximum and RMS by measure, as a table, or return an empty list if there are none."""
     if not errors:
         return []
-    names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
+    names = sorted(errors, key=list(_spec.MEASURE_NAMES.values()).index)
     rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
     return [format_table(("declared error", "max", "rms"), rows)]
 

@@ -10,6 +10,7 @@ import typer
 
 import csplat
 from csplat.context import Context
+from csplat.decoder import read_header
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import SearchInterrupted
 from csplat.model import SplatModel
@@ -21,7 +22,7 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
-    describe_levels,
+    describe_first_picture,
     encode_file,
     format_cost,
     format_declared_errors,
@@ -49,7 +50,7 @@ def encode(
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     levels: Annotated[
-        str | None, typer.Option(metavar="LEVELS", help="auto, merged, or 1 to 16. Default: none.")
+        str | None, typer.Option(metavar="LEVELS", help="auto, merged, 1 to 16, or none. Default: none.")
     ] = None,
     up: shared.HiddenUp = None,
     attribute_psnr: Annotated[
@@ -100,9 +101,9 @@ def encode(
     far that meets the target. --max-error limits errors of means, covariance,
     opacities, sh0 to sh4; --max-error 0 keeps the values of SPZ. Views are
     virtual without --data, which requires the render extra, or --cameras.
-    --levels adds coarser versions of the scene, which viewers show first: 35 %
-    more bytes, and minutes; merged takes seconds, and looks worse. --help-all
-    shows --keep, --cameras, --up and all others.
+    --levels adds coarser versions of the scene, which viewers show first: a
+    third more bytes, and minutes; merged takes a sixth of the time, and looks
+    worse. --help-all shows --keep, --cameras, --up and all others.
 
     Examples:
       csplat encode scene.ply scene.csplat
@@ -170,9 +171,6 @@ def encode(
                 _publish_encoded(interrupt.best, source, output, out)
             raise
         _publish_encoded(encoded, source, output, out)
-        if level_count is None:
-            written = encoded.source.changed(count=encoded.result.report.splat_count)
-            out.remark(*describe_levels(written, options, context))
 
 
 def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output) -> None:
@@ -196,6 +194,8 @@ def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output
     if UP in metadata.estimated and metadata.up is not None:
         out.remark(f"{shared.describe_estimated_up(metadata.up)}, and stored as such: --up sets another")
     out.remark(format_encoding(encoded, source, output))
+    data = encoded.result.content
+    out.remark(*describe_first_picture(read_header(output if data is None else data)))
     out.publish(encoded.as_json())
 
 
@@ -205,9 +205,7 @@ def _publish_estimate(
     """Report memory, disk space and time that an encoding would take; writes no .csplat file."""
     with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:
         cost = estimate_cost(scene, options, context, choose_levels(scene.count, options, levels))
-        lines = describe_levels(scene, options, context) if levels is None else []
     out.publish(cost.as_json(), format_cost(cost))
-    out.remark(*lines)
 
 
 def _find_views(

@@ -531,13 +531,15 @@ def parse_target(
 
 
 def parse_levels(text: str | None) -> LevelCount:
-    """Parse a number of levels of detail, `auto` or `merged`; return `None` for `None`."""
+    """Parse a number of levels of detail, `auto` or `merged`; return `None` for `None` and `none`."""
     from csplat_tools.level_builder import LEVELS_MAX  # takes 10 ms, which other commands do without
 
-    if text is None or text == "auto" or text == "merged":
+    if text is None or text == "none":
+        return None
+    if text == "auto" or text == "merged":
         return text  # type: ignore[return-value]  # mypy does not narrow a str by ==
     if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= LEVELS_MAX:
-        raise typer.BadParameter(f"--levels is {text}, expected auto, merged or 1 to {LEVELS_MAX}")
+        raise typer.BadParameter(f"--levels is {text}, expected auto, merged, 1 to {LEVELS_MAX} or none")
     return int(text)
 
 
