@@ -70,12 +70,13 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
 
     packages = ("codec/js", "codec/js-encoder")
     names = (f"{folder}/package.json" for folder in packages)
-    for name in ("pyproject.toml", "codec/csplat/__init__.py", *names):
+    for name in ("CITATION.cff", "pyproject.toml", "codec/csplat/__init__.py", *names):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     project = tmp_path / "pyproject.toml"
-    (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n", "utf-8")
-    assert 1 == prepared(f"v{csplat.__version__}", "https://github.com/owner/csplat")
+    for heading in ("[Unreleased]", f"[{csplat.__version__}]"):  # a citation needs the date
+        (tmp_path / "CHANGELOG.md").write_text(f"## {heading}\n", "utf-8")
+        assert 1 == prepared(f"v{csplat.__version__}", "https://github.com/owner/csplat")
     (tmp_path / "CHANGELOG.md").write_text(f"## [{csplat.__version__}] - 2027-01-01\n", "utf-8")
     text, before = project.read_bytes(), tomllib.loads(project.read_text("utf-8"))
     assert 1 == prepared("v9.9.9", "https://github.com/owner/csplat")
@@ -94,6 +95,9 @@ def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path
         for folder in packages:
             package = json.loads((tmp_path / folder / "package.json").read_text("utf-8"))
             assert {"type": "git", "url": f"git+{url}.git", "directory": folder} == package["repository"]
+        citation = (tmp_path / "CITATION.cff").read_text("utf-8")
+        written = f"repository-code: {url}\ndate-released: 2027-01-01\n"
+        assert (ROOT / "CITATION.cff").read_text("utf-8") + written == citation
 
 
 def readme_of_the_package(project):

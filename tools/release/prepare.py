@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prepare the packages of a release: check tag and changelog, and write the repository's address into their metadata.
+"""Prepare the packages of a release: check tag and changelog, and write address and date into metadata.
 
 The project names no home of its own, so a release takes it from where it is made. `make dist TAG=v1.0.0 URL=https://…`
 calls this before it builds. npm accepts a provenance only if `repository` in package.json is where it was built.
@@ -20,7 +20,7 @@ _PACKAGES = ("codec/js", "codec/js-encoder")  # of npm
 
 
 def main(words: list[str] | None = None, root: Path = ROOT) -> int:
-    """Change pyproject.toml and both package.json in place; status 1: tag or changelog have another version."""
+    """Change pyproject.toml, both package.json and CITATION.cff; status 1: tag or changelog have another version."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tag", required=True, help="`v` and the version")
     parser.add_argument("--url", required=True, help="of the repository, https")
@@ -33,9 +33,14 @@ def main(words: list[str] | None = None, root: Path = ROOT) -> int:
     if args.tag != f"v{version}":
         sys.stderr.write(f"error: the tag is {args.tag}, expected v{version}, as codec/csplat/__init__.py states\n")
         return 1
-    if f"## [{version}]" not in (root / "CHANGELOG.md").read_text("utf-8"):
-        sys.stderr.write(f"error: CHANGELOG.md has no section [{version}]\n")
+    dates = re.findall(
+        rf"(?m)^## \[{re.escape(version)}\] - (\d{{4}}-\d\d-\d\d)$", (root / "CHANGELOG.md").read_text("utf-8")
+    )
+    if not dates:
+        sys.stderr.write(f"error: CHANGELOG.md has no section [{version}] - YEAR-MONTH-DAY\n")
         return 1
+    citation = root / "CITATION.cff"
+    citation.write_text(with_release(citation.read_text("utf-8"), args.url, dates[0]), "utf-8", newline="\n")
     project.write_text(with_links(with_urls(text, args.url), f"{args.url}/blob/{args.tag}"), "utf-8", newline="\n")
     for folder in _PACKAGES:
         package = root / folder / "package.json"
@@ -76,6 +81,18 @@ def with_links(text: str, base: str) -> str:
     changed, count = re.subn(r"(?<=replacement = )'[^']*'", lambda _: rf"'[\1]({base}/\2)'", text)
     assert count == 1, "pyproject.toml has no substitution for the links of the README"
     return changed
+
+
+def with_release(text: str, url: str, date: str) -> str:
+    """Return a CITATION.cff with the repository and the date of a release; those that are there are replaced.
+
+    Args:
+        text: the file; `make spec` writes its version.
+        url: address of the repository.
+        date: of the release, YYYY-MM-DD.
+    """
+    kept = re.sub(r"(?m)^(repository-code|date-released): .*\n", "", text)
+    return f"{kept}repository-code: {url}\ndate-released: {date}\n"
 
 
 if __name__ == "__main__":
