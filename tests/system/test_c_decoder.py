@@ -160,6 +160,39 @@ def test_the_lines_of_the_page_run(tmp_path):
     assert {"csplat.h", "csplat.pc"} <= {path.name for path in (tmp_path / "installed").rglob("*")}
 
 
+@pytest.mark.parametrize(("options", "zlib"), [
+    (["-DBUILD_SHARED_LIBS=OFF"], True),
+    (["-DBUILD_SHARED_LIBS=OFF", "-DCSPLAT_ZLIB=OFF"], False),
+    (["-DBUILD_SHARED_LIBS=ON", "-DCMAKE_DISABLE_FIND_PACKAGE_ZLIB=ON"], False),
+], ids=["zlib", "switched off", "absent"])  # fmt: skip
+def test_a_project_of_cmake_finds_the_library(tmp_path, options, zlib):
+    if shutil.which("cmake") is None:
+        absent("there is no cmake")
+
+    def cmake(*arguments):
+        made = run(["cmake", *map(str, arguments)])
+        assert 0 == made.returncode, made.stdout + made.stderr
+
+    prefix, project, alias = tmp_path / "prefix", tmp_path / "project", tmp_path / "alias"
+    cmake("-S", C, "-B", tmp_path / "c", "-DCMAKE_BUILD_TYPE=Debug", f"-DCMAKE_INSTALL_PREFIX={prefix}", *options)
+    cmake("--build", tmp_path / "c", "--target", "install")
+    assert zlib == ("find_dependency(ZLIB)" in next(prefix.rglob("csplatConfig.cmake")).read_text("utf-8"))
+    lines = (C / "README.md").read_text("utf-8").split("```cmake\n")[1].split("```")[0]
+    project.mkdir()
+    shutil.copy(C / "example.c", project / "main.c")
+    head = "cmake_minimum_required(VERSION 3.14)\nproject(app C)\n"
+    (project / "CMakeLists.txt").write_text(head + lines, "utf-8")
+    cmake("-S", project, "-B", project, f"-DCMAKE_PREFIX_PATH={prefix}")
+    cmake("--build", project)
+    told = run([project / "app", VECTORS / "valid" / "rich.csplat"])
+    assert (0, "") == (told.returncode, told.stderr)
+    alias.mkdir()
+    shutil.copy(C / "example.c", alias / "main.c")
+    inside = re.sub("find_package.*", f"add_subdirectory({C} c)", lines)
+    (alias / "CMakeLists.txt").write_text(head + inside, "utf-8")
+    cmake("-S", alias, "-B", alias, *options)  # a name with :: that is no target is an error
+
+
 def test_the_sample_of_the_guide_decodes(decoder, tmp_path):
     sample = (ROOT / "codec" / "EMBEDDING.md").read_text(encoding="utf-8").split("```c\n")[1].split("```")[0]
     (tmp_path / "sample.c").write_text(
