@@ -6,6 +6,7 @@ Also: csplat_render.scorer, csplat_tools.cli.compare.
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -159,3 +160,13 @@ def test_a_page_shows_source_file_and_difference_of_each_view(scene, camera_file
     assert [f"file, {one.psnr:.1f} dB" for one in compared.quality.each] == re.findall(r"<b>(file, [^<]*)", text)
     with pytest.raises(InputError, match=r"page\.html exists"):
         compare(scene, scene, views=views, pictures=page)
+
+
+def test_scores_need_neither_pillow_nor_matplotlib(scene, camera_file, tmp_path, monkeypatch):
+    write_ply(tmp_path / "a.ply", scene)
+    words = ("compare", tmp_path / "a.ply", tmp_path / "a.ply", "--cameras", camera_file)
+    for package in ("PIL", "matplotlib"):
+        monkeypatch.setitem(sys.modules, package, None)
+    call(*words)
+    assert "this needs pillow, of the extra render" in call(*words, "--pictures", tmp_path / "out", status=1).stderr
+    assert "this needs pillow" in call(*words[:3], "--data", tmp_path, status=1).stderr

@@ -64,7 +64,7 @@ def compare(
     With --data, A and B are also scored against the held-out images. Scenes
     that do not fit in memory are rendered from the disk. --level applies to B.
     --backend gpu computes PSNR on a GPU (extra gpu), which may differ in the
-    third decimal. Requires the render extra.
+    third decimal. --pictures and --data require the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
