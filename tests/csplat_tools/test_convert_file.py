@@ -339,6 +339,24 @@ def test_floaters_are_splats_without_neighbours():
     assert 3001 == left.count == len(left.model())
 
 
+def test_the_number_of_dropped_floaters_is_reported_apart_from_a_crop(tmp_path):
+    ball = np.random.default_rng(0).standard_normal((3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.concatenate([ball, [[30, 0, 0], [0, 50.0, 0], [900, 0, 0]]])
+    write_ply(tmp_path / "in.ply", cloud(points, np.full(3003, 0.03)))
+    words = ("convert", tmp_path / "in.ply", tmp_path / "out.ply", "--crop", "0,0,0,99", "--drop-floaters", "--json")
+    made = call(*words)
+    result = json.loads(made.stdout)
+    assert (3003, 2, 3000) == (result["source_splats"], result["floaters"], result["splats"])
+    assert "--drop-floaters: 2 of 3,002 splats dropped" in made.stderr
+    assert f"--crop: along x, y, z as {tmp_path / 'in.ply'} stores them" in made.stderr
+
+
+def test_a_preset_of_csplat_is_refused_with_the_command_that_has_it(ply, tmp_path):
+    line = call("convert", ply, tmp_path / "out.csplat", "--preset", "small", status=1).stderr
+    assert "run `csplat encode IN OUT.csplat --preset small`" in line
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["meta.json", "lod-meta.json"])
 def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):

@@ -220,6 +220,7 @@ class Conversion:
         source_format, target_format: names of the formats.
         source_count: number of splats of the source.
         count, sh_degree: number of splats and SH degree of the target.
+        floater_count: number of floaters dropped.
         levels: number of splats of each level of detail of the target, finest first.
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
         lost: contents that the target format does not support.
@@ -235,6 +236,7 @@ class Conversion:
     target_format: str
     source_count: int
     count: int
+    floater_count: int
     sh_degree: int
     levels: tuple[int, ...]
     source_bytes: int
@@ -253,6 +255,7 @@ class Conversion:
             "format": self.target_format,
             "source_splats": self.source_count,
             "splats": self.count,
+            "floaters": self.floater_count,
             "sh_degree": self.sh_degree,
             "levels": list(self.levels),
             "source_bytes": self.source_bytes,
@@ -336,7 +339,10 @@ def convert_file(
         own = reader.file_axes if overrides is None or overrides.coordinate_system is None else ""
         filter_axes = changes.axes or changes.to_axes or own or before
         changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
+        last = Filters(drop_floaters=changes.drop_floaters, sh_degree=sh_degree)
+        changes = replace(changes, drop_floaters=False, sh_degree=None)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
+        count, levels = levels[0].count, [last.apply(scene) for scene in levels]
         if writes.name in _WITH_VIEW and not dry_run and not writes.keeps(levels[0]):
             levels = [with_first_view(levels[0], progress=progress)]
         scene, counts = levels[0], tuple(changed.count for changed in levels if changed.count)
@@ -344,7 +350,7 @@ def convert_file(
         exact = frozenset(ARRAYS) if keeps else writes.exact
         rounded = tuple(name for name in ARRAYS if name not in exact and (name != "shN" or scene.sh_degree))
         result = Conversion(
-            reader.format, writes.name, reader.count, scene.count, scene.sh_degree, counts or (0,),
+            reader.format, writes.name, reader.count, scene.count, count - scene.count, scene.sh_degree, counts or (0,),
             size_on_disk(local), writes.expected_bytes(scene), lost, rounded, (),
             (before, writes.axes or scene.metadata.coordinate_system), filter_axes, (),
         )  # fmt: skip

@@ -96,7 +96,8 @@ class Format:
     def at(self, preset: str) -> Format:
         """Return the format at the precision of a preset; raise an `InputError` if it has no such preset."""
         if preset != "balanced" and preset not in self.presets:
-            remedy = "csplat encode has it" if self.name == "csplat" else "SPZ has small"
+            encode = f"run `csplat encode IN OUT.csplat --preset {preset}`"
+            remedy = encode if self.name == "csplat" else "SPZ has small"
             raise InputError(f"{self.title} cannot be written with the preset {preset}: {remedy}")
         return self.presets.get(preset, self)
 

@@ -4,9 +4,9 @@
 import numpy as np
 from checked import cloud
 
-from csplat import EncodeOptions, _spec, decode, encode
+from csplat import EncodeOptions, _spec, decode, encode, write_ply
 from csplat_conformance.manifest import VECTORS
-from csplat_tools.inspect.file_description import FileDescription, describe_file
+from csplat_tools.inspect.file_description import FileDescription, describe_file, describe_other_format
 
 _FRAME_SIZE = _spec.CHUNK_HEADER_SIZE + _spec.TILE_HEAD_SIZE
 
@@ -45,6 +45,18 @@ def test_the_box_is_around_all_centres_and_most_of_it_is_without_far_splats():
     assert np.all(most[1] - most[0] < 20)
     inside = np.all((means >= most[0]) & (means <= most[1]), axis=1)
     assert inside.mean() > 0.5
+    on_each_axis = ((means >= most[0]) & (means <= most[1])).mean(axis=0)
+    assert np.all((on_each_axis >= 0.9) & (on_each_axis < 1))
+
+
+def test_the_second_box_of_a_ply_has_the_middle_of_its_splats(tmp_path):
+    means = np.linspace(-1, 1, 101)[:, None] * (1.0, 2.0, 4.0)
+    write_ply(tmp_path / "scene.ply", cloud(np.random.default_rng(1).permutation(means)))
+    report, text = describe_other_format(tmp_path / "scene.ply")
+    assert [-1, -2, -4, 1, 2, 4] == report["box"]
+    assert "box          -1,-2,-4,1,2,4\nmiddle 90 %  -0.9,-1.8,-3.6,0.9,1.8,3.6" in text
+    write_ply(tmp_path / "one.ply", cloud(means[:1]))
+    assert "middle" not in describe_other_format(tmp_path / "one.ply")[1]
 
 
 def test_without_splats_there_is_no_box():

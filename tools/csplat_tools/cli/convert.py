@@ -28,7 +28,9 @@ def convert(
     rotate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Degrees about x, then y, then z of IN.")] = None,
     scale: Annotated[float | None, typer.Option(metavar="FACTOR", help="Enlarge by this factor.")] = None,
     translate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Move along IN's axes, scene units.")] = None,
-    crop: Annotated[str | None, typer.Option(metavar="NUMBERS", help="Keep a box (6 numbers) or sphere (4).")] = None,
+    crop: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="Keep a box X,Y,Z,X,Y,Z or sphere X,Y,Z,R.")
+    ] = None,
     drop_floaters: Annotated[bool, typer.Option("--drop-floaters", help="Drop splats far from others.")] = False,
     up: shared.Up = None,
     sh_degree: shared.ShDegree = None,
@@ -60,12 +62,14 @@ def convert(
     Changes are made in this order: --to-axes (in --help-all), --rotate,
     --scale, --translate, --crop, --drop-floaters, --sh-degree. They are along
     the axes of IN, or of --to-axes. Some formats have fixed axes, such as y
-    up in glTF. A line reports what the format cannot hold. For .csplat files,
-    `csplat encode` has presets and targets. A new folder with a file
-    lod-meta.json gets streamed SOG, with all levels of detail. --compress
-    makes a .glb about 15 times smaller: its splats are a .csplat file, as the
-    extension CSPLAT_gaussian_splatting_compression_1 specifies. IN is copied
-    bit for bit if it is a .csplat file, and encoded otherwise.
+    up in glTF. A box is two opposite corners, which `csplat info` prints, a
+    sphere its centre and radius; add the origin if it is not 0. A line
+    reports what the format cannot hold. For .csplat files, `csplat encode`
+    has presets and targets. A new folder with a file lod-meta.json gets
+    streamed SOG, with all levels of detail. --compress makes a .glb about 15
+    times smaller: its splats are a .csplat file, as the extension
+    CSPLAT_gaussian_splatting_compression_1 specifies. IN is copied bit for
+    bit if it is a .csplat file, and encoded otherwise.
 
     Formats, their highest SH degree, and what else they hold (header: axes,
     origin, unit, metadata, antialiased, flat, colour space):
@@ -120,6 +124,10 @@ def convert(
     if made.lost_words():
         note(f"lost on the way: {made.lost_words()}")
     out.print_findings(made.losses)
+    if drop_floaters:
+        out.remark(
+            f"--drop-floaters: {made.floater_count:,} of {counted(made.floater_count + made.count, 'splat')} dropped"
+        )
     moving = {"--rotate": rotate, "--translate": translate, "--crop": crop}
     if given := [name for name, value in moving.items() if value is not None]:
         out.remark(f"{' and '.join(given)}: along {_filter_axes(source, made, chosen=to_axes is not None)}")
@@ -141,8 +149,9 @@ def _filter_axes(source: str, made: Conversion, *, chosen: bool) -> str:
     """Describe the axes of the filters; `chosen`: by --to-axes."""
     if chosen:
         return f"the axes x, y, z = {made.filter_axes} of --to-axes"
-    named = f"x, y, z = {made.filter_axes}" if made.filter_axes != UNSPECIFIED else "which it does not name"
-    return f"the axes of {source}, {named}; --to-axes chooses others"
+    if made.filter_axes == UNSPECIFIED:
+        return f"x, y, z as {source} stores them; it does not state which way they point: --axes does"
+    return f"the axes of {source}, x, y, z = {made.filter_axes}; --to-axes chooses others"
 
 
 _BOX_NUMBERS, _SPHERE_NUMBERS = 6, 4  # two corners; centre and radius

@@ -22,7 +22,7 @@ def extract(
         str, typer.Argument(metavar="IN.csplat", help="A .csplat file, its URL, or - for standard input.")
     ],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -.")],
-    box: Annotated[str, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Two corners, scene units.")],
+    box: Annotated[str, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Two opposite corners, scene units.")],
     force: shared.Force = False,
     report: shared.Report = None,
     as_json: shared.Json = False,
@@ -51,8 +51,8 @@ def extract(
         part = csplat.extract(file, corners, stream)
         size, read, requests, axes = file.size_bytes, file.bytes_read, file.requests, file.header.coordinate_system
         is_whole = part.splat_count == file.count
-    which = "which it does not name" if axes == UNSPECIFIED else f"x, y, z = {axes}"
-    out.remark(f"--box: along the axes of {source}, {which}")
+    which = f"x, y, z as {source} stores them" if axes == UNSPECIFIED else f"the axes of {source}, x, y, z = {axes}"
+    out.remark(f"--box: along {which}")
     out.remark(
         f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size_bytes)};"
         f" read {format_bytes(read)} of {format_bytes(size)}, in {counted(requests, 'request')}"

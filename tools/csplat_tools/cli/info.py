@@ -33,8 +33,10 @@ def info(
     """Describe a file: scene, sizes, options, declared errors.
 
     Nothing is decoded: a large file takes hardly longer than a small one,
-    and `csplat verify` checks if the file is intact. --source requires the
-    render extra.
+    and `csplat verify` checks if the file is intact. Of a PLY, positions are
+    read for its box. The second box has the middle 90 % of the splats on each
+    axis, in a .csplat file at least, by tiles: `extract --box` takes either,
+    `convert --crop` if the origin is 0. --source requires the render extra.
 
     Examples:
       csplat info scene.csplat

@@ -37,12 +37,14 @@ from csplat.errors import FormatError
 from csplat.formats import format_by_name
 from csplat.scene import Scene
 from csplat.scene_metadata import ESTIMATED, SRGB, TRAINING, UP, VIEW, SceneMetadata
+from csplat.types import F64
 from csplat_tools.console import format_bytes
 from csplat_tools.scene_files import findings_as_json
 
 _NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
 _STREAM_CLAUSE = "STR-6"
-_MOST = 0.9  # share of the tiles that "box of most" covers on each side of each axis
+_MIDDLE = 0.9  # share of the splats in the second box, on each axis: without those far away
+_SAMPLE_MAX = 1_000_000  # splats of a PLY by which the second box is found; all would take 24 bytes each
 _OFFSET_SIZE = 4  # bytes of a column's offset, i32
 
 
@@ -182,8 +184,8 @@ class FileDescription:
         """Return a box around the centres of splats, in scene units relative to the origin, as `--box` takes it.
 
         Args:
-            share: share of the tiles of level 0 whose sides it covers on each side of each axis, 0 to 1: with less
-                than 1, far splats do not stretch it.
+            share: least share of the splats of level 0 that it covers on each axis, 0 to 1: tiles are left out at both
+                ends while all of them have at most half of the rest.
 
         Returns:
             x, y, z of the smallest corner, then of the largest; `None` without splats.
@@ -191,9 +193,15 @@ class FileDescription:
         boxes = tile_boxes(self.header, self.header.tiles)
         if not len(boxes):
             return None
-        low = np.quantile(boxes[:, 0], 1 - share, axis=0, method="higher")
-        high = np.quantile(boxes[:, 1], share, axis=0, method="lower")
-        return [*low.tolist(), *high.tolist()]
+        counts = np.array([tile.splat_count for tile in self.header.tiles])
+
+        def end(sides: F64) -> F64:
+            passed = np.cumsum(counts[np.argsort(sides, axis=0)], axis=0)
+            first = np.argmax(passed > (1 - share) / 2 * counts.sum(), axis=0)
+            chosen: F64 = np.sort(sides, axis=0)[first, range(3)]
+            return chosen
+
+        return [*end(boxes[:, 0]).tolist(), *(-end(-boxes[:, 1])).tolist()]
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -269,7 +277,7 @@ def describe_file(data: bytes | mmap) -> FileDescription:
 
 
 def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
-    """Describe a scene in any format without reading its splats.
+    """Describe a scene in any format without reading its splats, except those of a PLY, whose box is found.
 
     Returns:
         JSON-compatible values, and the same as text.
@@ -281,6 +289,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
     with csplat.open(path) as scene:
         metadata, size, count = scene.metadata, size_on_disk(path), scene.count
         per_splat = size / count if count else None
+        boxes = _boxes_of_splats(scene) if scene.format == "ply" and count else (None, None)
         report = {
             "format": scene.format,
             "size_bytes": size,
@@ -291,6 +300,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "coordinate_system": metadata.coordinate_system,
             "file_axes": scene.file_axes or metadata.coordinate_system,
             "origin": list(scene.origin),
+            **({"box": whole} if (whole := boxes[0]) else {}),
             "unit_metres": metadata.unit_metres,
             "antialiased": metadata.antialiased,
             "flat": metadata.flat,
@@ -302,7 +312,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "findings": findings_as_json(scene.findings),
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-        words = describe_placement(scene, count, metadata)
+        words = describe_placement(scene, count, metadata) | _describe_boxes(*boxes)
         if scene.file_axes:
             words["axes"] = f"{scene.file_axes}, read as {metadata.coordinate_system}"
         if scene.levels:
@@ -384,7 +394,7 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
     """Describe the scene in words, by title."""
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata)
-    words |= _describe_boxes(file)
+    words |= _describe_boxes(file.box(), file.box(_MIDDLE))
     words["tiles"] = _describe_tiles(file)
     if header.extras:
         words["extra"] = ", ".join(map(_describe_column, header.extras))
@@ -682,10 +692,21 @@ def _registered_name(names: Mapping[int, str], id_: int, what: str, offset: int)
     return names[id_]
 
 
-def _describe_boxes(file: FileDescription) -> dict[str, str]:
-    """Return the box of all splats and, if there are enough tiles, that of most, as `--box` and `--crop` take them."""
-    shares = {"box": 1.0, "box of most": _MOST} if len(file.header.tiles) >= 1 / (1 - _MOST) else {"box": 1.0}
-    boxes = {title: file.box(share) for title, share in shares.items()}
+def _boxes_of_splats(scene: Scene) -> tuple[list[float], list[float]]:
+    """Return boxes, as `FileDescription.box`, of all splats and of the middle 90 % on each axis."""
+    every = -(-scene.count // _SAMPLE_MAX)
+    ends, sample = [], []
+    for splats, model in scene.numbered():
+        ends += [model.means.min(axis=0), model.means.max(axis=0)]
+        sample.append(model.means[-splats.start % every :: every])
+    low, high = np.quantile(np.concatenate(sample), [(1 - _MIDDLE) / 2, (1 + _MIDDLE) / 2], axis=0)
+    whole = [*np.min(ends, axis=0).tolist(), *np.max(ends, axis=0).tolist()]
+    return whole, [*low.tolist(), *high.tolist()]
+
+
+def _describe_boxes(whole: list[float] | None, middle: list[float] | None) -> dict[str, str]:
+    """Return the box of all splats and, if it is another, that of the middle 90 %, as `--box` takes them."""
+    boxes = {"box": whole, "middle 90 %": None if middle == whole else middle}
     return {title: ",".join(f"{value:.4g}" for value in box) for title, box in boxes.items() if box is not None}
 
 
