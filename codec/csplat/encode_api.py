@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal, Protocol, overload
@@ -23,6 +24,7 @@ from csplat.errors import InputError, SearchInterrupted
 from csplat.model import SplatModel, check_model
 from csplat.out_of_core import encode_on_disk, estimate_cost
 from csplat.plugins import load_plugins
+from csplat.ply.column_names import dropped_columns
 from csplat.scene import Scene
 
 #: Levels of detail: their number above the scene; "auto" for as many as it takes to reach 4,096 splats, "merged" for
@@ -91,6 +93,8 @@ def encode(
 ) -> bytes | None:
     """Encode a scene. Its metadata are written as they are: `csplat_render.first_view` adds a first view for viewers.
 
+    A `UserWarning` names extra columns that are not kept, as do the notes of `encode_with_report`.
+
     A scene that does not fit in memory is encoded on disk, if `out` is a path, with the same bytes: it is sorted into
     buckets of neighbours in a working folder, and these are coded one by one, by worker processes. If the encoding is
     interrupted, finished work stays in the folder. Scripts must guard their own code by `if __name__ == "__main__":`,
@@ -138,6 +142,8 @@ def encode(
     result = encode_with_report(
         scene, options, out=out, target=target, views=views, importance=importance, levels=levels, context=context
     )
+    for note in _list_losses(scene, options):
+        warnings.warn(note, stacklevel=2)
     return result.data if out is None else None
 
 
@@ -176,6 +182,7 @@ def encode_with_report(
         check_model("the encoder", scene)
         scene = Scene.of(scene)
     builder = _builder_of(levels, scene.count, options)
+    notes = _list_losses(scene, options)
     if target is not None or importance is not None:
         if context.is_bounded:
             raise InputError("a target and an importance exclude workers, a limit of memory, and resume")
@@ -187,7 +194,7 @@ def encode_with_report(
                 raise InputError(
                     "the scene is encoded on disk, because it exceeds memory or workers are set: out must be a path"
                 )
-            return EncodeResult(encode_on_disk(scene, path, options, cost, context, builder))
+            return EncodeResult(encode_on_disk(scene, path, options, cost, context, builder)).with_notes(*notes)
     try:
         result = _encode_model(scene.model(), options, target, views, importance, builder, context)
     except SearchInterrupted as interrupt:
@@ -195,7 +202,12 @@ def encode_with_report(
             _write(interrupt.best, out)
         raise
     _write(result, out)
-    return result
+    return result.with_notes(*notes)
+
+
+def _list_losses(scene: SplatModel | Scene, options: EncodeOptions | None) -> list[str]:
+    """Return a line that names the extra columns that are not kept, if there are any."""
+    return [dropped_columns(list(scene.extra)).text] if scene.extra and not (options and options.keep_extra) else []
 
 
 def _write(result: EncodeResult, out: Output | None) -> None:

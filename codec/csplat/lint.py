@@ -17,7 +17,6 @@ part of the scene.
 | `truncated` | fewer splats than the header declares | error |
 | `malformed` | a row that cannot be parsed, or binary rows changed by a text-mode transfer | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
-| `extra-columns` | columns that splats do not have: dropped unless extra columns are kept | repair |
 | `list-columns` | list properties of splats: dropped | repair |
 | `other-elements` | elements other than the splats: dropped | repair |
 | `nonfinite-rows` | splats with NaN or infinity: dropped; an error if no splats remain | repair |
@@ -28,6 +27,7 @@ part of the scene.
 | `one-scale` | one scale instead of three: spheres, which may have no rotations | note |
 | `packed-colours` | three bytes of colour in a row, of which the header declares one (nerfstudio) | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
+| `extra-columns` | columns that splats do not have: dropped unless extra columns are kept | note |
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
 | `shuffled-columns` | columns in an unusual order | note |

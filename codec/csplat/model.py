@@ -260,7 +260,10 @@ def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
     for name, column in extra.items():
         shape = column.shape if isinstance(column, np.ndarray) else ()
         if shape[:1] != (n,) or len(shape) > 2 or not 2 <= (*shape, 2)[1] <= most:
-            raise InputError(f"extra column {name!r} is not an array of {n} values, or of {n} times 2 to {most}")
+            remedy = f": split it into columns {name!r}, '{name}_{most}' and so on" if shape[1:] > (most,) else ""
+            raise InputError(
+                f"extra column {name!r} has shape {shape}, expected ({n},) or ({n}, 2) to ({n}, {most}){remedy}"
+            )
         if column.dtype.kind not in "iuf":
             raise InputError(f"extra column {name!r} is {column.dtype}, expected integers or floats")
 

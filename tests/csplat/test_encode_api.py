@@ -111,9 +111,39 @@ def test_up_to_64_extra_columns_keep_their_bits_in_any_byte_order(make_model):
         kept = decoded.extra[name]
         assert column.dtype.newbyteorder("<") == kept.dtype
         assert column[result.source_index].tobytes() == kept.astype(column.dtype).tobytes()
-    assert {} == dict(round_trip(model)[0].extra)  # dropped by default
     with pytest.raises(InputError, match="65 extra columns, expected at most 64"):
         round_trip(replace(model, extra=columns | {"last": columns["c0"]}), keep_extra=True)
+
+
+def test_extra_columns_are_kept_or_their_loss_is_told(make_model, tmp_path):
+    csplat.write_ply(tmp_path / "a.ply", make_model(200, 0, extra={"object_id": np.arange(200, dtype=np.int32)}))
+    model = csplat.read(tmp_path / "a.ply")
+    text = "extra columns object_id are dropped: .* keep_extra=True keeps them"
+    with pytest.warns(UserWarning, match=text) as caught:
+        data = encode(model)
+    with pytest.warns(UserWarning, match=text), csplat.open(tmp_path / "a.ply") as scene:
+        encode(scene, EncodeOptions(bucket_splats=100), out=tmp_path / "a.csplat", context=Context(workers=1))
+    assert [__file__] == [warning.filename for warning in caught]
+    (note,) = encode_with_report(model).report.notes
+    assert note == str(caught[0].message)
+    assert {} == csplat.decode(data).extra == csplat.decode(tmp_path / "a.csplat").extra
+    kept = encode_with_report(model, EncodeOptions(keep_extra=True))
+    assert (["object_id"], ()) == (list(csplat.decode(kept.data).extra), kept.report.notes)
+    assert {} == csplat.read(tmp_path / "a.ply", keep_extra=False).extra
+
+
+def test_long_features_take_several_columns_and_other_types_are_refused(make_model, tmp_path):
+    feature = np.random.default_rng(0).normal(size=(20, 512)).astype(np.float32)
+    with pytest.raises(InputError, match=r"shape \(20, 512\), .*: split it into columns 'clip', 'clip_64' and"):
+        make_model(20, extra={"clip": feature})
+    columns = {f"clip_{at}" if at else "clip": feature[:, at : at + 64] for at in range(0, 512, 64)}
+    csplat.write_ply(tmp_path / "a.ply", make_model(20, 0, extra=columns))
+    decoded, result = round_trip(csplat.read(tmp_path / "a.ply"), keep_extra=True)
+    assert list(columns) == list(decoded.extra)
+    assert np.array_equal(feature[result.source_index], np.hstack(list(decoded.extra.values())))
+    for dtype in (np.float16, np.int64):
+        with pytest.raises(InputError, match=f"'c' is {np.dtype(dtype)}, expected uint8, .*float64: convert it by ast"):
+            round_trip(make_model(20, 0, extra={"c": np.zeros(20, dtype)}), keep_extra=True)
 
 
 def test_extra_columns_of_several_components_and_semantics_decode(make_model):
@@ -131,7 +161,7 @@ def test_extra_columns_of_several_components_and_semantics_decode(make_model):
         with pytest.raises(InputError, match=f"the semantic of extra column 'one' is invalid, expected .*{words}"):
             round_trip(make_model(30, extra=columns, semantics={"one": wrong}), keep_extra=True)
     for shape in ((30, 1), (30, 65), (30, 2, 2), (29, 2)):
-        with pytest.raises(InputError, match="extra column 'c' is not an array of 30 values, or of 30 times 2 to 64"):
+        with pytest.raises(InputError, match=r"'c' has shape .*, expected \(30,\) or \(30, 2\) to \(30, 64\)"):
             make_model(30, extra={"c": np.zeros(shape)})
 
 

@@ -303,7 +303,7 @@ def test_the_usual_columns_take_precedence(path):
     rows = good_rows(names=[*NAMES, "scalar_opacity", *COLOURS], scalar_opacity=9.0)
     put(path, rows)
     assert "scalar_opacity: duplicated" in found(path)["second-columns"].text
-    assert "red, green, blue are not splat attributes" in found(path)["extra-columns"].text
+    assert "red, green, blue are dropped" in found(path)["extra-columns"].text
     assert np.array_equal(alpha_of_logits(rows["opacity"]), read_ply(path).opacities)
     assert np.array_equal(rows["f_dc_1"], read_ply(path).sh0[:, 1])
 
@@ -375,7 +375,7 @@ def test_other_elements_and_dynamic_splats_are_named_and_dropped(path):
             read_ply(path, strict=True)
     for names in (["motion_0", "trbf_center"], ["t", "scale_t"]):
         put(path, good_rows(names=[*NAMES, *names]))
-        assert "dropped; the file contains dynamic (4D) splats: their time" in found(path)["extra-columns"].text
+        assert "; the file contains dynamic (4D) splats: their time" in found(path)["extra-columns"].text
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -495,9 +495,10 @@ def test_extra_columns_are_named_and_dropped(path):
     rows = np.zeros(5, [*good_rows().dtype.descr, ("object_id", "<i4"), ("conf", "<f8")])
     rows["rot_0"] = 1
     put(path, rows)
-    assert 2 == counts(path)["extra-columns"]
-    with pytest.raises(InputError, match="columns object_id, conf are not splat attributes"):
-        read_ply(path, strict=True)
+    finding = found(path)["extra-columns"]
+    assert (2, "note") == (finding.count, finding.kind)
+    assert finding.text.startswith("extra columns object_id, conf are dropped: --keep-extra of csplat encode or")
+    assert {} == read_ply(path, strict=True).extra
     assert ["object_id", "conf"] == list(read_ply(path, strict=True, keep_extra=True).extra)
 
 

@@ -103,11 +103,19 @@ def test_encode_takes_metadata_that_a_ply_lacks(tmp_path, ply):
 
 
 def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):
+    source = tmp_path / "longer.ply"
+    write_ply(source, make_model(20, 0))
+    source.write_bytes(source.read_bytes() + b"more")
+    quiet = invoke("encode", source, tmp_path / "q.csplat", "--quiet")
+    assert (1, True) == (quiet.stderr.count("\n"), "trailing-bytes" in quiet.stderr)
+
+
+def test_extra_columns_are_kept_or_a_note_names_the_option(tmp_path, make_model):
     source = tmp_path / "extra.ply"
     write_ply(source, make_model(20, 0, extra={"object_id": np.arange(20, dtype=np.int32)}))
-    quiet = invoke("encode", source, tmp_path / "q.csplat", "--quiet")
-    assert (1, True) == (quiet.stderr.count("\n"), "extra-columns" in quiet.stderr)
-    printed("encode", source, tmp_path / "c.csplat", "--keep-extra")
+    text = "note: extra-columns: extra columns object_id are dropped: --keep-extra of csplat encode"
+    assert 1 == invoke("encode", source, tmp_path / "a.csplat").stderr.count(text)
+    assert "extra columns" not in invoke("encode", source, tmp_path / "c.csplat", "--keep-extra").stderr
     assert list(range(20)) == sorted(decode(tmp_path / "c.csplat").extra["object_id"])
 
 

@@ -137,10 +137,8 @@ def read_source(
     """
     overrides = overrides or MetadataOverrides()
     if opened is not None and not in_memory:
-        dropped = [] if keep_extra or not opened.extra else [dropped_columns(list(opened.extra))]
-        findings = [*opened.findings, *dropped]
-        refuse(findings, strict=strict)
-        return overrides.apply_to_scene(opened).changed(findings=findings)
+        refuse(opened.findings, strict=strict)
+        return overrides.apply_to_scene(opened)
     context.progress("reading", 0.0)
     with source_path(file) as local:
         if opened is None or opened.format in CHEAP_TO_REOPEN:

@@ -62,7 +62,8 @@ class EncodeOptions:
             encoded bucket by bucket. A smaller number takes less memory and leads to worse steps and codebooks.
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
         deflate: "auto", "libdeflate" or "zlib".
-        keep_extra: write the model's extra columns.
+        keep_extra: write the model's extra columns, and prune no splats for targets. Otherwise a note of the report
+            names the columns.
 
     Examples:
         >>> import csplat

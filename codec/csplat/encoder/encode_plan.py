@@ -253,7 +253,8 @@ def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
     for name, column in model.extra.items():
         kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}"
         if kind not in ids:
-            raise InputError(f"extra column {name!r} has dtype {column.dtype}, expected one of {', '.join(ids)}")
+            names = ", ".join(np.dtype(f"{id[0]}{int(id[1:]) // 8}").name for id in ids)
+            raise InputError(f"extra column {name!r} is {column.dtype}, expected {names}: convert it by astype")
         text = _record_text(name, f"the name of extra column {name!r}", 1, _spec.EXTRA_NAME_MAX)
         semantic = model.metadata.semantics.get(name, "")
         meaning = _record_text(semantic, f"the semantic of extra column {name!r}", 0, _spec.EXTRA_SEMANTIC_MAX)

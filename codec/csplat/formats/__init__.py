@@ -69,7 +69,7 @@ def read(
     format: str | None = None,
     *,
     strict: bool = False,
-    keep_extra: bool = False,
+    keep_extra: bool = True,
     sh_degree: int | None = None,
 ) -> SplatModel:
     """Read a scene in any format into memory.
@@ -77,7 +77,7 @@ def read(
     Args:
         file, format, sh_degree: as in `open`.
         strict: refuse files that need repairs.
-        keep_extra: keep columns that are not splat attributes.
+        keep_extra: keep columns that are not splat attributes, in `SplatModel.extra`.
 
     Examples:
         >>> import csplat

@@ -215,9 +215,9 @@ def _sphere_column(names: _NameIndex, scales: Sequence[str]) -> str:
 def dropped_columns(names: Sequence[str]) -> Finding:
     """Report dropped columns that are not splat attributes, and the kind of scene that they indicate."""
     meaning = _kind_of_columns(names)
-    text = f"columns {', '.join(names)} are not splat attributes: dropped"
+    text = f"extra columns {_list_some(names)} are dropped: --keep-extra of csplat encode or keep_extra=True keeps them"
     text += "" if meaning is None else f"; the file contains {meaning}"
-    return Finding("extra-columns", len(names), text, "repair")
+    return Finding("extra-columns", len(names), text, "note")
 
 
 def colour_finding(colours: Sequence[str], largest: float, why: str = "") -> Finding:

@@ -191,7 +191,7 @@ def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(sample, h
     assert data == merge(*halves)[1]
     assert None is not read_declared_bounds(halves[0])
     assert (None, None) == (read_declared_bounds(data), read_options(data))
-    done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
+    done, data = merge(*halves, options=EncodeOptions(preset="fast", keep_extra=True), codebooks_max=3)
     assert "they have 4 codebooks together, a file has at most 3" == done.why
     assert len(sample) == len(decode(data))
 

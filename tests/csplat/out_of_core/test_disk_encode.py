@@ -27,6 +27,8 @@ from csplat_conformance.validator import validate
 from csplat_tools.encode_file import encode_file
 from csplat_tools.scene_files import with_first_view
 
+pytestmark = pytest.mark.filterwarnings("ignore:extra columns confidence are dropped")  # files must be alike without
+
 
 @pytest.fixture(scope="module")
 def model(sample_path):

@@ -136,7 +136,7 @@ def test_extra_columns_but_no_normals_are_verified(make_model):
     EncodeOptions(means_coding="axis", keep_extra=True),
 ])  # fmt: skip
 def test_a_description_accounts_for_every_byte(make_model, options):
-    data = encode(make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)}), options)
+    data = encode_with_report(make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)}), options).data
     described, header = describe_file(data).as_json(), read_header(data)
     attributes, layers = (sum(one["size_bytes"] for one in described[by].values()) for by in ("attributes", "layers"))
     assert attributes + sum(described["overhead"].values()) == len(data)

@@ -11,7 +11,7 @@ import html
 
 import numpy as np
 
-from csplat.encode_api import encode
+from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_render.first_view import viewing_metadata
@@ -38,8 +38,8 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
         InputError: the scene cannot be encoded, or the installation is incomplete.
     """
     shown = most_visible(model, most_splats)
-    data = encode(shown.with_metadata(viewing_metadata(shown)), EncodeOptions(preset="fast"))
-    page = export_page(data, "scene").page.decode()
+    made = encode_with_report(shown.with_metadata(viewing_metadata(shown)), EncodeOptions(preset="fast"))
+    page = export_page(made.data, "scene").page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'
         f' style="width: 100%; height: {_HEIGHT}px; border: 0"></iframe>'

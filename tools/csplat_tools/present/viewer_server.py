@@ -28,7 +28,7 @@ from urllib.parse import quote, unquote, urlencode, urlsplit
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import SceneHeader, read_header
-from csplat.encode_api import encode
+from csplat.encode_api import encode_with_report
 from csplat.encoder import EncodeOptions, PresetName
 from csplat.errors import FormatError, InputError
 from csplat.file_source import open_binary, read_bytes
@@ -324,7 +324,7 @@ def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -
         CsplatError: the scene is not valid.
     """
     source = with_first_view(read_source(str(path), context=context))
-    data = encode(source.model(), EncodeOptions(preset=preset), context=context)
+    data = encode_with_report(source.model(), EncodeOptions(preset=preset), context=context).data
     return ViewerScene(f"{stem}.csplat", data, len(data), read_header(data), tuple(source.findings), source.size_bytes)
 
 
