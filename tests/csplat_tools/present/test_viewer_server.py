@@ -162,11 +162,11 @@ def test_the_bound_address_decides_which_hosts_are_served(scene_path):
         try:
             with served(scene_path, host=place) as server:
                 found = {host: ask(server, "/", Host=host)[0] for host in (*good, *bad)}
-        except InputError:  # a system without IPv6
+        except InputError:  # a system without IPv6, or without /etc/hosts
             continue
         assert dict.fromkeys(good, 302) | dict.fromkeys(bad, 421) == found, place
         served_at.append(place)
-    assert {"LOCALHOST", ANYWHERE} <= set(served_at)
+    assert {"127.1", ANYWHERE} <= set(served_at)
 
 
 def test_addresses_that_cannot_be_served_are_refused(scene_path):
