@@ -196,6 +196,8 @@ def test_mouse_and_keys_move_the_camera(viewer, light):
     before, after = viewer.moved(lambda: page.mouse.dblclick(135, 95))
     np.testing.assert_allclose(before["eye"], after["eye"], atol=1e-9)  # the head turns to the point
     assert not np.allclose(pivot(before), pivot(after), atol=1e-3)
+    shown = page.text_content("#point").removeprefix("Point ").split(",")
+    np.testing.assert_allclose(np.array(shown, float), pivot(after), rtol=1e-3)
     viewer.moved(lambda: page.keyboard.press("r"))
     page.emulate_media(reduced_motion="reduce")
     page.evaluate("csplatViewer.rig.orbit(0.5, 0.2)")

@@ -38,6 +38,7 @@ const showing = new SceneViewer(canvas, wishes, {
     overlay.describe(view.facts.title || overlay.name, view.facts.licence);
   },
   placed: () => tools(true),
+  chosen: (point) => overlay.point(point),
   progress: (progress) => overlay.progress(progress),
   frame: (stats) => overlay.statistics(stats, showing.stage.moving),
   shown: (stats) => {

@@ -96,6 +96,7 @@ export class Overlay {
     this.name = name;
     this.licence = '';
     this.failed = false;
+    html('point').hidden = true;
     this.hideError();
     html('welcome').hidden = true;
     this.describe(name);
@@ -113,6 +114,16 @@ export class Overlay {
     html('info').hidden = !title;
     html('title').textContent = title;
     document.title = title ? `${title} – csplat viewer` : 'csplat viewer';
+  }
+
+  /**
+   * Show a point of the scene, as `csplat extract --box` takes it.
+   *
+   * @param {readonly number[]} point
+   */
+  point(point) {
+    html('point').textContent = `Point ${point.map((value) => Number(value.toPrecision(4))).join(',')}`;
+    html('point').hidden = false;
   }
 
   /** @param {Progress} progress */

@@ -8,7 +8,7 @@ import { completeSize, fitCamera } from './camera_maths.mjs';
 import { createEngine } from './engine.mjs';
 import { E_INPUT, E_SUPERSEDED, EngineError } from './engine_error.mjs';
 import { readCameras } from './page.mjs';
-import { OrbitCamera } from './orbit_camera.mjs';
+import { OrbitCamera, pivotOf } from './orbit_camera.mjs';
 import { CameraList, emptyPose } from './camera_list.mjs';
 import { CanvasSize } from './canvas_size.mjs';
 
@@ -24,6 +24,7 @@ import { CanvasSize } from './canvas_size.mjs';
  * @property {() => void} [header] called when `view.facts` holds the file's metadata
  * @property {() => void} [placed] called when the camera may have been placed
  * @property {() => void} [moved] called when the camera has moved, other than by `useCameras`
+ * @property {(point: readonly number[]) => void} [chosen] called with a point that users have chosen to orbit
  * @property {(progress: Progress) => void} progress
  * @property {(stats: Stats) => void} frame called when a frame has been drawn
  * @property {(stats: Stats) => void} shown called when the scene has been drawn completely
@@ -67,7 +68,11 @@ export class SceneViewer {
           this.known = this.rig.pose;
           if (hasMoved && !this.isSetting) hooks.moved?.();
         },
-        pivotAt: (x, y) => this.view.pivotAt(x, y, canvas.clientWidth, canvas.clientHeight),
+        pivotAt: (x, y) => {
+          const pose = this.view.pivotAt(x, y, canvas.clientWidth, canvas.clientHeight);
+          if (pose) hooks.chosen?.(pivotOf(pose));
+          return pose;
+        },
         calm: hooks.calm,
       },
       reach,
