@@ -156,6 +156,8 @@ def test_extra_columns_and_degree_4_are_converted_encoded_or_reported_by_every_c
     assert "lost on the way: extra columns motion_0" in call("convert", rich, tmp_path / "a.spz").stderr
     for words in (("encode", rich, a), ("compare", rich, rich), ("lint", rich)):
         assert "extra columns motion_0 are dropped: --keep-extra of csplat encode" in call(*words).output
+    assert "extra columns" not in call("lint", rich, "--fix", tmp_path / "fixed.ply").output
+    assert {"motion_0"} == csplat.read(tmp_path / "fixed.ply").extra.keys()
     write_ply(source, make_model(60, 4))
     for more, degree in (("--sh-degree", 3), 3), ((), 4):
         call("encode", source, a, "--force", *more)

@@ -71,7 +71,9 @@ def encode(
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
     scheduler: shared.HiddenScheduler = None,
     dry_run: shared.HiddenDryRun = False,
-    keep_extra: shared.HiddenKeepExtra = False,
+    keep_extra: Annotated[
+        bool, typer.Option("--keep-extra", hidden=True, help="Keep columns that splats do not have.")
+    ] = False,
     unit_metres: Annotated[
         float | None, typer.Option(metavar="METRES", hidden=True, help="Length of a scene unit. Default: unknown.")
     ] = None,

@@ -22,7 +22,6 @@ from csplat_tools.scene_files import findings_as_json
 def lint(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another format of `convert`, or -.")],
     fix: Annotated[str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY if that is safe.")] = None,
-    keep_extra: shared.KeepExtra = False,
     force: shared.Force = False,
     report: shared.Report = None,
     as_json: shared.Json = False,
@@ -46,12 +45,12 @@ def lint(
         check_name(fix, ".ply", "--fix", source)
     with source_path(source) as path:
         findings = formats.lint_file(path)
-        if keep_extra:
+        if fix is not None:  # which keeps them
             findings = [finding for finding in findings if finding.id != "extra-columns"]
         errors = any(finding.kind == "error" for finding in findings)
         if fix is not None and not errors:
             with csplat.open(path) as scene:
-                write_model(fix, scene if keep_extra else scene.without_extra(), absolute=False)
+                write_model(fix, scene, absolute=False)
     clean = all(finding.kind == "note" for finding in findings)
     table = _format_findings(findings)
     if fix == STANDARD_STREAM:

@@ -142,9 +142,6 @@ _scheduler = typer.Option("--scheduler", metavar="ADDRESS", help="Dask cluster, 
 Scheduler = Annotated[str | None, _scheduler]
 HiddenScheduler = Annotated[str | None, hidden(_scheduler)]
 HiddenDryRun = Annotated[bool, typer.Option("--dry-run", hidden=True, help="Estimate size, time and memory only.")]
-_keep_extra = typer.Option("--keep-extra", help="Keep columns that splats do not have.")
-KeepExtra = Annotated[bool, _keep_extra]
-HiddenKeepExtra = Annotated[bool, hidden(_keep_extra)]
 
 
 def parse_level(text: str | None) -> tuple[int, int | None]:
