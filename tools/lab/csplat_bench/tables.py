@@ -30,6 +30,7 @@ Column = Sequence[str] | Mapping[str, Any]
 
 # Okabe and Ito's colours, which readers with any colour vision can tell apart.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "0.3", "0.6")
+_LEGEND_INCHES = 2.4  # width of an entry of a legend
 _OPERATORS = {"/": operator.truediv, "*": operator.mul, "-": operator.sub}
 
 
@@ -168,7 +169,7 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
             value, `columns` panels in a row; `note`, a field whose text is shown next to a point; `styles`, colour and
             matplotlib's format by series; `labels` of series and panels; `x_title`, `y_title`, `x_scale` (log or
             linear), `ticks`, `x_limits`, `y_limits`, `size` in inches.
-        path: the file, which is replaced. A panel's legend shows the series that are not in an earlier one.
+        path: the file, which is replaced. A legend above the panels shows all series.
 
     Raises:
         InputError: there are no rows.
@@ -189,14 +190,13 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
         grid = figure.subplots(-(-len(panels) // across), across, squeeze=False)
         for axis in grid.flat[len(panels) :]:
             axis.set_visible(False)
-        known: set[str] = set()
+        series: dict[str, Any] = {}  # a line for each label
         for axis, panel in zip(grid.flat, panels, strict=False):
             _draw_panel(axis, spec, [row for row in rows if _value(spec.get("per"), row) == panel])
             axis.set_title(spec.get("labels", {}).get(panel, panel), fontsize=9)
-            lines = [line for line in axis.get_lines() if line.get_label() not in known]
-            known.update(line.get_label() for line in lines)
-            if lines:
-                axis.legend(handles=lines, frameon=False, fontsize=8, loc="lower right")
+            series = {line.get_label(): line for line in axis.get_lines()} | series
+        across = max(1, int(figure.get_figwidth() / _LEGEND_INCHES))
+        figure.legend(handles=series.values(), ncols=across, frameon=False, fontsize=8, loc="outside upper center")
         figure.supxlabel(spec.get("x_title", spec["x"]), fontsize=9)
         figure.supylabel(spec.get("y_title", spec["y"]), fontsize=9)
         figure.savefig(buffer, format="svg", dpi=100, metadata={"Date": None, "Source": digest(spec, rows)})
