@@ -9,13 +9,16 @@ import re
 import shlex
 import sys
 from collections import Counter
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from captures import photograph, shell
 from command_line import call, hide_renderer
+from models import with_facts
 
 from csplat import EncodeOptions, InputError, Target
-from csplat_tools import parse_grid, tradeoff
+from csplat_tools import parse_formats, parse_grid, tradeoff
 from csplat_tools.scene_files import load_scene
 from csplat_tools.tradeoffs import Tradeoff, TradeoffRow, format_tradeoff, make_tradeoff_page, measure_grid
 from csplat_tools.views import BLACK, ViewSet
@@ -39,6 +42,28 @@ def test_a_grid_lists_settings():
     ):  # fmt: skip
         with pytest.raises(InputError):
             parse_grid(text)
+
+
+def test_other_formats_are_settings_with_all_their_presets():
+    found = [(one.name, " ".join(one.words)) for one in parse_formats("spz, sog,spz")]
+    assert [("spz", ""), ("spz=small", "--preset small"), ("sog", "")] == found
+    for text in ("", "spz,xyz", "csplat", "ksplat", "precision=36"):
+        with pytest.raises(InputError, match=r"is not another format, expected some of .*spz, .*sog"):
+            parse_formats(text)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_views")
+def test_other_formats_are_scored_on_the_axes_and_at_the_origin_of_the_scene(make_model):
+    model = make_model(60, 1)
+    model = replace(model, shN=np.float32(0.2) * model.shN)  # SPZ clamps at 1
+    tilted = with_facts(model, entries={"up": [0.6, 0.0, 0.8]})
+    for scene in (replace(model, origin=(100.0, 0.0, 0.0)), with_facts(model, coordinate_system="LUB"), tilted):
+        rows = tradeoff(scene, parse_formats("spz,sog,gltf")).rows
+        assert {"spz", "spz=small", "sog", "gltf"} == {row.setting.name for row in rows}
+        psnr = {row.setting.name: row.psnr for row in rows}
+        assert 35 < psnr["spz=small"] < psnr["spz"] < psnr["gltf"]
+        assert psnr["sog"] > 35
 
 
 def row_of(setting, size_bytes=1000, psnr=40.0, images=None):
@@ -120,11 +145,12 @@ def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
     photograph(shell(3).select(slice(0, 100)), folder)
     monkeypatch.chdir(tmp_path)
     views = ("--data", "my set", "--json")
-    done = call("tradeoff", "my set/scene.ply", *views, "--what", "presets=fast,targets=3kB", "--page", "page.html")
-    assert "2/2 targets=3kB: " in done.stderr
+    words = ("--what", "presets=fast,targets=3kB", "--with", "spz", "--page", "page.html")
+    done = call("tradeoff", "my set/scene.ply", *views, *words)
+    assert "2/4 targets=3kB: " in done.stderr
     assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
     rows = json.loads(done.stdout)["points"]
-    assert {"presets=fast", "targets=3kB"} == {row["name"] for row in rows}
+    assert {"presets=fast", "targets=3kB", "spz", "spz=small"} == {row["name"] for row in rows}
     assert min(row["size_bytes"] for row in rows) <= 3000
     for row in rows:
         _, *words = shlex.split(row["command"])
@@ -139,6 +165,7 @@ def test_wrong_words_and_missing_packages_are_refused_before_any_work(sample_pat
     (tmp_path / "mine.html").write_text("mine")
     for status, words in (
         (2, ("--what", "presets=huge")), (2, ("--what", "presets", "--preset", "huge")), (2, ("--page", "-")),
+        (2, ("--with", "spz,xyz")),
         (2, ("--data", "x", "--cameras", "y")), (1, ("--page", tmp_path / "mine.html")),
     ):  # fmt: skip
         call("tradeoff", sample_path, *words, status=status)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from csplat_tools.inspect.comparison import Comparison, compare
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
     from csplat_tools.scene_files import SceneLike
-    from csplat_tools.tradeoffs import Tradeoff, parse_grid, tradeoff
+    from csplat_tools.tradeoffs import Tradeoff, parse_formats, parse_grid, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "ViewSet",
     "compare",
     "find_view_set",
+    "parse_formats",
     "parse_grid",
     "run_batch",
     "simplify",
@@ -55,6 +56,7 @@ _MODULE_OF = {
     "ViewSet": "csplat_tools.views",
     "compare": "csplat_tools.inspect.comparison",
     "find_view_set": "csplat_tools.views",
+    "parse_formats": "csplat_tools.tradeoffs",
     "parse_grid": "csplat_tools.tradeoffs",
     "run_batch": "csplat_tools.batch",
     "simplify": "csplat_tools.optimise.simplify",

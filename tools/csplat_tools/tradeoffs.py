@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure size, quality and time of many encodings of a scene, for a table, JSON, and an HTML page with plots.
 
-A *grid* lists settings of `csplat encode`, as in `presets,precision=36:44,targets=38:1MB,simplify=0.5`.
+A *grid* lists settings of `csplat encode`, as in `presets,precision=36:44,targets=38:1MB,simplify=0.5`. Files of other
+formats, as `csplat convert` writes them, are measured alike.
 """
 
 from __future__ import annotations
@@ -13,11 +14,18 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
+from itertools import cycle
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import formats
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
+from csplat.disk_files import temporary_folder
+from csplat.editing.transform import DEFAULT_AXES, axes_rotation, rotate_scene, rotation_to_axes
 from csplat.encode_api import encode_with_report
 from csplat.encoder import PRESETS, EncodeOptions, PresetName, Target
 from csplat.errors import CsplatError, InputError
@@ -50,13 +58,13 @@ _DECODE_RUNS = 3  # timed runs, of which the median is reported
 
 @dataclass(frozen=True)
 class GridSetting:
-    """A way to encode a scene.
+    """A way to encode a scene, or to write it in another format.
 
     Attributes:
-        group: one of `GROUPS`.
-        value: the value in this group, as in a grid.
-        options, target: arguments of `csplat.encode_with_report`.
-        words: the same as options of `csplat encode`.
+        group: one of `GROUPS`, or the name of another format.
+        value: the value in this group, as in a grid; the preset of another format, "" if it is the usual one.
+        options, target: arguments of `csplat.encode_with_report`; of another format, only the preset counts.
+        words: the same as options of `csplat encode`, or of `csplat convert`.
     """
 
     group: str
@@ -67,8 +75,13 @@ class GridSetting:
 
     @property
     def name(self) -> str:
-        """The grid that has this setting alone: `precision=44`."""
-        return f"{self.group}={self.value}"
+        """The grid that has this setting alone, `precision=44`; or a format with its preset, `spz` or `spz=small`."""
+        return f"{self.group}={self.value}" if self.value else self.group
+
+    @property
+    def is_other_format(self) -> bool:
+        """True if the file is not a .csplat file."""
+        return self.group not in GROUPS
 
 
 def parse_grid(text: str = ",".join(GROUPS), preset: PresetName = "balanced") -> list[GridSetting]:
@@ -118,6 +131,29 @@ def _parse_setting(group: str, value: str, options: EncodeOptions) -> GridSettin
     else:
         option, target = "--keep", Target(keep=float(value))
     return GridSetting(group, value, options, target, (option, value, "--preset", options.preset))
+
+
+def parse_formats(text: str) -> list[GridSetting]:
+    """Parse names of other formats, separated by commas, into settings: each format with all its presets.
+
+    Examples:
+        >>> import csplat_tools
+        >>> [setting.name for setting in csplat_tools.parse_formats("spz,sog")]
+        ['spz', 'spz=small', 'sog']
+
+    Raises:
+        InputError: csplat does not both read and write a format of that name, or it holds csplat.
+    """
+    known = {one.name: one for one in formats.formats() if one.open and one.write and "csplat" not in one.name}
+    settings = dict[str, GridSetting]()
+    for name in (part.strip() for part in text.split(",")):
+        if name not in known:
+            raise InputError(f"{name!r} is not another format, expected some of {', '.join(known)}")
+        settings[name] = GridSetting(name, "", EncodeOptions(), None, ())
+        for preset in known[name].presets:
+            setting = GridSetting(name, preset, EncodeOptions(cast(PresetName, preset)), None, ("--preset", preset))
+            settings[setting.name] = setting
+    return list(settings.values())
 
 
 @dataclass(frozen=True)
@@ -220,7 +256,7 @@ def tradeoff(
 
     Args:
         scene: a model, or a file in any format but .csplat.
-        grid: the settings, see `parse_grid`; `None`: all groups.
+        grid: the settings, see `parse_grid` and `parse_formats`; `None`: all groups.
         views: the views that targets use, and test views for the scores; `None`: virtual views.
         path: path of the scene in commands.
         view_words: options of `csplat encode` that give the same views, for commands.
@@ -229,7 +265,8 @@ def tradeoff(
 
     Examples:
         >>> import csplat_tools
-        >>> measured = csplat_tools.tradeoff("scene.ply", csplat_tools.parse_grid("presets"))  # doctest: +SKIP
+        >>> grid = csplat_tools.parse_grid("presets") + csplat_tools.parse_formats("spz,sog")
+        >>> measured = csplat_tools.tradeoff("scene.ply", grid)  # doctest: +SKIP
         >>> [(row.setting.name, row.size_bytes, row.psnr) for row in measured.front]  # doctest: +SKIP
 
     Raises:
@@ -245,18 +282,17 @@ def tradeoff(
     viewed = with_first_view(source).model()  # as `csplat encode` writes it
 
     def measure(setting: GridSetting) -> TradeoffRow:
-        """Encode the scene with a setting, decode the file, and score it."""
-        start = time.perf_counter()
-        used = around if setting.target else None
-        made = encode_with_report(viewed, setting.options, target=setting.target, views=used, context=context)
-        encode_seconds = time.perf_counter() - start
-        decoded, decode_seconds = _time_decoding(made.data, context)
-        compared = compare(source, decoded, views=around, source_index=made.source_index, context=context)
-        words = (path, _suggested_name(path, setting), *setting.words, *(view_words if setting.target else ()))
+        """Write a file with a setting, read it, and score it."""
+        if setting.is_other_format:
+            made = _write_other_format(source, setting)
+        else:
+            made = _encode(viewed, setting, around if setting.target else None, context)
+        compared = compare(source, made.model, views=around, source_index=made.source_index, context=context)
+        command = "convert" if setting.is_other_format else "encode"
+        words = (command, path, _suggested_name(path, setting), *setting.words, *(view_words if setting.target else ()))
         return TradeoffRow(
-            setting, shlex.join(("csplat", "encode", *words)), len(made.data), source.size_bytes / len(made.data),
-            len(decoded), compared.psnr, compared.ssim, compared.images, encode_seconds,
-            decode_seconds,
+            setting, shlex.join(("csplat", *words)), made.size_bytes, source.size_bytes / made.size_bytes,
+            len(made.model), compared.psnr, compared.ssim, compared.images, made.encode_seconds, made.decode_seconds,
         )  # fmt: skip
 
     rows, failures = measure_grid(parse_grid() if grid is None else grid, measure, say, context.progress)
@@ -297,13 +333,48 @@ def measure_grid(
     return sorted(rows, key=lambda row: row.size_bytes), failures
 
 
-def _time_decoding(data: bytes, context: Context) -> tuple[SplatModel, float]:
-    """Return the decoded splats, and the median of the times of `_DECODE_RUNS` runs in seconds."""
+class _MadeFile(NamedTuple):
+    """The size of a file, the splats read from it, their indices in the source, and times as in `TradeoffRow`."""
+
+    size_bytes: int
+    model: SplatModel
+    source_index: NDArray[np.intp] | None
+    encode_seconds: float
+    decode_seconds: float
+
+
+def _encode(model: SplatModel, setting: GridSetting, views: ViewSet | None, context: Context) -> _MadeFile:
+    """Encode a model, and decode the file."""
+    start = time.perf_counter()
+    made = encode_with_report(model, setting.options, target=setting.target, views=views, context=context)
+    seconds = time.perf_counter() - start
+    decoded, decode_seconds = _time_reading(lambda: decode(made.data, context=context))
+    return _MadeFile(len(made.data), decoded, made.source_index, seconds, decode_seconds)
+
+
+def _write_other_format(source: Scene, setting: GridSetting) -> _MadeFile:
+    """Write a scene in another format, and read the file, on the axes and at the origin of the scene."""
+    other = formats.format_by_name(setting.group)
+    with temporary_folder() as folder:
+        file, start = folder / f"scene{other.suffixes[0]}", time.perf_counter()
+        formats.write_levels(file, [source], other.name, setting.options.preset)
+        seconds, size = time.perf_counter() - start, file.stat().st_size
+        model, decode_seconds = _time_reading(lambda: formats.read(file, other.name))
+    if other.axes:
+        turn = axes_rotation(other.axes, DEFAULT_AXES) @ rotation_to_axes(source.metadata, other.axes)
+        model = rotate_scene(model, turn.T)
+    if "origin" not in other.carries:
+        model = replace(model, origin=source.origin)
+    return _MadeFile(size, model, None, seconds, decode_seconds)
+
+
+def _time_reading(read: Callable[[], SplatModel]) -> tuple[SplatModel, float]:
+    """Return the splats that are read, and the median of the times of `_DECODE_RUNS` runs in seconds."""
     seconds = list[float]()
     model: SplatModel | None = None
     for _ in range(_DECODE_RUNS):
         start = time.perf_counter()
-        model = decode(data, context=context)
+        model = read()
         seconds.append(time.perf_counter() - start)
     assert model is not None  # there is at least one run
     return model, statistics.median(seconds)
@@ -312,7 +383,8 @@ def _time_decoding(data: bytes, context: Context) -> tuple[SplatModel, float]:
 def _suggested_name(path: str, setting: GridSetting) -> str:
     """Return the name of the file that the command of a setting writes, by the source's name and the setting."""
     stem = "scene" if path == STANDARD_STREAM else PurePath(path).stem
-    return f"{stem}-{setting.group}-{setting.value}.csplat"
+    suffix = formats.format_by_name(setting.group).suffixes[0] if setting.is_other_format else ".csplat"
+    return "-".join([stem, setting.group, *([setting.value] if setting.value else [])]) + suffix
 
 
 # Columns of the table: title, meaning, attribute of the row, and format.
@@ -413,6 +485,7 @@ _STYLES = {  # markers, in colours that colour-blind readers can tell apart, on 
     "targets": ("D", "#e69f00"),
     "simplify": ("v", "#009e73"),
 }
+_OTHER_STYLES = (("^", "#cc79a7"), ("P", "#7a5cc4"), ("X", "#8c6d46"), ("*", "#3aa6b9"))  # other formats, in turn
 # Places of a label: the offset from its mark in points, and its alignment; the first free place is taken.
 _PLACES = tuple(
     (distance * x, distance * y, {-1: "right", 0: "center", 1: "left"}[x], {-1: "top", 0: "center", 1: "bottom"}[y])
@@ -445,7 +518,8 @@ def _plot(tradeoff: Tradeoff, key: str, label: str, level: float | None = None) 
             axes.plot(*zip(*marks(tradeoff.front), strict=True), "--", color=INK, linewidth=1)
         if level is not None:
             axes.axhline(level, color=INK, linewidth=1, linestyle=":", label="the source")
-        for group, (marker, colour) in _STYLES.items():
+        others = dict.fromkeys(row.setting.group for row in tradeoff.rows if row.setting.is_other_format)
+        for group, (marker, colour) in {**_STYLES, **dict(zip(others, cycle(_OTHER_STYLES), strict=False))}.items():
             rows = [row for row in tradeoff.rows if row.setting.group == group]
             if rows:
                 axes.plot(*zip(*marks(rows), strict=True), marker, color=colour, label=group, zorder=3)
@@ -453,7 +527,8 @@ def _plot(tradeoff: Tradeoff, key: str, label: str, level: float | None = None) 
             _use_plain_ticks(axis)
         figure.legend(loc="outside upper left", ncols=5, fontsize="small")
         figure.draw_without_rendering()  # fixes the limits of the axes
-        _label_marks(axes, marks(tradeoff.rows), [row.setting.value for row in tradeoff.rows])
+        settings = [row.setting for row in tradeoff.rows]
+        _label_marks(axes, marks(tradeoff.rows), [one.name if one.is_other_format else one.value for one in settings])
 
     return draw_svg(draw, _SIZE, key)
 

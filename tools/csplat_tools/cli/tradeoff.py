@@ -19,6 +19,7 @@ def tradeoff(
     source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
     page: Annotated[str | None, typer.Option(metavar="PAGE.html", help="Write an HTML report.")] = None,
     what: Annotated[str | None, typer.Option(metavar="GROUPS", help="Settings, see above. Default: all.")] = None,
+    with_: Annotated[str | None, typer.Option("--with", metavar="FORMATS", help="Other formats, e.g. spz,sog.")] = None,
     preset: shared.Preset = "balanced",
     cameras: shared.Cameras = None,
     data: shared.Data = None,
@@ -37,21 +38,24 @@ def tradeoff(
       simplify=0.7:0.5    fractions of the splats; slow
     A group without `=` has default values. PSNR is measured against the
     source's renders, as by `csplat compare`, and against the images of --data.
-    --page and --data require the render extra.
+    --with adds files of other formats, as `csplat convert` writes them with
+    each of its presets. --page and --data require the render extra.
 
     Examples:
       csplat tradeoff scene.ply
       csplat tradeoff scene.ply --page report.html --report report.json
       csplat tradeoff scene.ply --what presets,precision=36:44:52
+      csplat tradeoff scene.ply --with spz,sog --page report.html
       csplat tradeoff scene.ply --data capture --what presets,targets=30:32
     """
     import csplat_tools
     from csplat_tools.optimise.target_encoding import expected_search_seconds
     from csplat_tools.scene_files import read_source
-    from csplat_tools.tradeoffs import GROUPS, format_tradeoff, make_tradeoff_page, parse_grid
+    from csplat_tools.tradeoffs import GROUPS, format_tradeoff, make_tradeoff_page, parse_formats, parse_grid
 
     out, views = Output(force, report, as_json, quiet), shared.ViewOptions(cameras, data)
     grid = shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
+    grid += [] if with_ is None else shared.checked(parse_formats, with_)
     searches = [(setting.options, setting.target) for setting in grid if setting.target is not None]
     out.check(inputs=(source, *views.inputs), named={"--page": page})
     require_renderer()
