@@ -11,6 +11,7 @@ import io
 import json
 import os
 import pty
+import re
 import resource
 import select
 import stat
@@ -58,6 +59,15 @@ def test_reports_as_json(tmp_path, ply):
     assert {"preset": "fast"} == report["options"]["asked"]
     quiet = invoke("encode", ply, out, "--quiet", "--force")
     assert ("", "") == (quiet.stdout, quiet.stderr)
+
+
+def test_the_first_line_has_sizes_and_the_last_names_what_shows_more(tmp_path, ply):
+    out = tmp_path / "out.csplat"
+    lines = invoke("encode", ply, out, "--preset", "fast").stderr.splitlines()
+    assert re.fullmatch(
+        r"[\d.]+ kB -> [\d.]+ kB, [\d.]+ times smaller: 200 splats of [\d.]+ bytes in 1 tile, .+ s", lines[0]
+    )
+    assert f"`csplat compare {ply} {out}` shows how it looks, `csplat info {out}` lists" in lines[-1]
 
 
 COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from csplat.formats import detect_format
 from csplat.model import MAX_SH_DEGREE
 from csplat.out_of_core import EncodingCost, estimate_cost, working_folder
 from csplat.scene import Scene
-from csplat_tools.console import format_bytes, format_estimate, format_table, note
+from csplat_tools.console import format_bytes, format_estimate, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_levels, read_streamed_levels
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, read_source, with_first_view
@@ -264,30 +263,20 @@ def format_cost(cost: EncodingCost) -> str:
     )
 
 
-def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Format declared errors, maximum and RMS by measure, as a table, or return an empty list if there are none."""
-    if not errors:
-        return []
-    names = sorted(errors, key=list(_spec.MEASURE_NAMES.values()).index)
-    rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
-    return [format_table(("declared error", "max", "rms"), rows)]
-
-
-def format_encoding(encoded: EncodedFile, source: str, output: str) -> str:
-    """Format counts, time, sizes and the PSNR, if it was measured, of an encoding as a line.
+def format_encoding(encoded: EncodedFile, source: str, output: str) -> list[str]:
+    """Format sizes, the PSNR, if it was measured, counts and time of an encoding as a line, and what shows more.
 
     Args:
         encoded: the written file.
         source, output: names of the files.
     """
-    report = encoded.result.report
-    per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
+    report, psnr = encoded.result.report, encoded.result.psnr
     ratio = encoded.source.size_bytes / report.size_bytes
-    splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
-    sizes = f"{format_bytes(encoded.source.size_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, psnr = "", encoded.result.psnr
-    if psnr is not None:
-        quality = f", PSNR {psnr:.2f} dB"
-    elif encoded.source.in_memory is not None and len(encoded.source) and "-" not in (source, output):
-        quality = f"; `csplat compare {source} {output}` shows how it looks"
-    return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"
+    sizes = f"{format_bytes(encoded.source.size_bytes)} -> {format_bytes(report.size_bytes)}, {ratio:.1f} times smaller"
+    per_splat = f" of {report.size_bytes / report.splat_count:.2f} bytes" if report.splat_count else ""
+    splats = f"{counted(report.splat_count, 'splat')}{per_splat} in {counted(report.tile_count, 'tile')}"
+    lines = [f"{sizes}{'' if psnr is None else f', PSNR {psnr:.2f} dB'}: {splats}, {encoded.seconds:.2f} s"]
+    if encoded.source.in_memory is not None and len(encoded.source) and "-" not in (source, output):
+        look = f"`csplat compare {source} {output}` shows how it looks, " if psnr is None else ""
+        lines.append(f"{look}`csplat info {output}` lists the errors that it declares")
+    return lines

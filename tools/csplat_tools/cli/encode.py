@@ -25,7 +25,6 @@ from csplat_tools.encode_file import (
     describe_first_picture,
     encode_file,
     format_cost,
-    format_declared_errors,
     format_encoding,
     read_degree,
 )
@@ -176,7 +175,7 @@ def encode(
 
 
 def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output) -> None:
-    """Print findings, notes, the search, errors and a line on sizes, and write the report.
+    """Print findings, notes, the search and lines on sizes, and write the report.
 
     Args:
         encoded: the written file.
@@ -191,11 +190,10 @@ def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output
         from csplat_tools.optimise.search_report import format_search
 
         out.remark(*format_search(report.search))
-    out.remark(*format_declared_errors(report.errors))
     metadata = encoded.source.metadata
     if UP in metadata.estimated and metadata.up is not None:
         out.remark(f"{shared.describe_estimated_up(metadata.up)}, and stored as such: --up sets another")
-    out.remark(format_encoding(encoded, source, output))
+    out.remark(*format_encoding(encoded, source, output))
     data = encoded.result.content
     out.remark(*describe_first_picture(read_header(output if data is None else data)))
     out.publish(encoded.as_json())
