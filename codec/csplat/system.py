@@ -251,7 +251,7 @@ def map_in_processes(
         workers: number of processes; 1 runs everything in this process.
 
     Raises:
-        OSError: a worker process was killed.
+        OSError: a worker process was killed, or the system has no semaphores.
     """
     if workers == 1 or len(items) < 2:
         for item in items:
@@ -263,7 +263,8 @@ def map_in_processes(
 
     start = "forkserver" if CAN_FORK else "spawn"
     workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin_worker, (work, shared))
+    with semaphore_errors_named():
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin_worker, (work, shared))
     try:
         futures = {pool.submit(_call_in_worker, item): item for item in items}
         for future in as_completed(futures):
@@ -272,6 +273,20 @@ def map_in_processes(
         raise OSError(errno.ENOMEM, "a worker process was killed, perhaps for lack of memory") from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def semaphore_errors_named() -> Iterator[None]:
+    """Say what is missing if a pool of processes cannot be made, of which Python says `Permission denied` alone.
+
+    Raises:
+        OSError: the system has no semaphores for processes.
+    """
+    try:
+        yield
+    except (PermissionError, FileNotFoundError) as error:
+        where = "/dev/shm is not writable" if sys.platform == "linux" else "there are none"  # noqa: S108  # a message
+        raise OSError(error.errno, f"worker processes need semaphores, but {where}: {error.strerror}") from None
 
 
 def _begin_worker(work: Callable[..., Any], shared: Any) -> None:

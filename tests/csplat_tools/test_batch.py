@@ -7,18 +7,21 @@ Also: csplat_tools.cli.batch.
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from unittest.mock import Mock
 
 import pytest
 from command_line import InThisProcess, call
 
 import csplat
 from csplat import InputError
+from csplat.system import map_in_processes
 from csplat_tools import batch, run_batch
 from csplat_tools.batch import find_tasks
 
@@ -107,6 +110,9 @@ def test_outputs_equal_those_of_the_command_and_are_not_made_again(scenes, tmp_p
     assert alone.read_bytes() == (out / "a.csplat").read_bytes()
     (out / "sub" / "b.csplat").unlink()
     assert ["done_before", "done", "failed"] == states(scenes, out, FAST)
+    assert [1, 1] == [(out / "index.html").read_text().count(word) for word in (">seconds", ">–<")]
+    assert ["done_before", "done_before", "failed"] == states(scenes, out, FAST)
+    assert ">seconds" not in (out / "index.html").read_text()
     assert ["done", "done"] == states(out, tmp_path / "plys", ("decode", "--sh-degree", "0"))
     assert 0 == csplat.read(tmp_path / "plys" / "a.ply").sh_degree
 
@@ -122,8 +128,20 @@ def test_other_damaged_and_old_files_are_kept(scenes, tmp_path):
         done = run_batch(scenes, out, FAST, match="a.ply")
         assert (message in done.results[0].error, False) == (True, done.has_page)
         assert (data, "mine") == ((out / "a.csplat").read_bytes(), page.read_text())
+    printed = call("batch", scenes, out, "--match", "a.ply", "--", *FAST, status=1)
+    assert ("index.html" in printed.stdout, "no page was written" in printed.stderr) == (False, True)
     assert ["done"] == states(scenes, out, FAST, match="a.ply", force=True)
     assert (whole, True) == ((out / "a.csplat").read_bytes(), "1 of 1" in page.read_text())
+
+
+def test_a_system_without_semaphores_is_named(scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "ProcessPoolExecutor", ProcessPoolExecutor)
+    refuse = Mock(side_effect=PermissionError(13, "No"))
+    monkeypatch.setattr("multiprocessing.synchronize._multiprocessing.SemLock", refuse)
+    line = r"error: worker processes need semaphores, but (/dev/shm is not writable|there are none): No \(EACCES\)\n"
+    assert re.fullmatch(line, call("batch", scenes, tmp_path / "out", "--", *FAST, status=1).stderr)
+    with pytest.raises(PermissionError, match="need semaphores"):
+        list(map_in_processes(int, 0, [1, 2], workers=2))
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ from csplat.file_source import read_bytes
 from csplat.formats import formats
 from csplat.out_of_core.bucket_workers import open_client
 from csplat.remote_store import is_url
-from csplat.system import interrupts_held, interrupts_noted, split_words
+from csplat.system import interrupts_held, interrupts_noted, semaphore_errors_named, split_words
 from csplat_render.kernels import thread_count
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
@@ -166,7 +166,8 @@ def run_batch(
         interrupts_noted(signal.SIGINT, signal.SIGTERM) as interrupts,
     ):
         new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker)
-        idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
+        with semaphore_errors_named():
+            idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
         try:
             while (todo or running) and not interrupts:
                 while todo and idle:
@@ -515,18 +516,19 @@ def make_batch_page(batch: Batch) -> str:
         "done": f"{len(done):,} of {len(batch.results):,}",
         "bytes": f"{format_bytes(source_bytes)} -> {format_bytes(output_bytes)}",
     }
-    columns: dict[str, Callable[[SceneResult], float | None]] = {
+    values: dict[str, Callable[[SceneResult], float | None]] = {
         "splats": lambda result: result.splats,
         "source, kB": lambda result: (result.source_bytes or 0) / 1e3,
         "output, kB": lambda result: (result.output_bytes or 0) / 1e3,
-        **({"PSNR, dB": lambda result: result.psnr} if any(result.psnr is not None for result in done) else {}),
+        "PSNR, dB": lambda result: result.psnr,
         "seconds": lambda result: result.seconds,
     }
+    columns = {title: of for title, of in values.items() if any(of(result) is not None for result in done)}
     heads = [html.Head("scene", kind="link"), *map(html.Head, columns)]
     rows = []
     for result in done:
-        values = (of(result) for of in columns.values())
-        rows.append([(result.output, result.path), *((_cell_text(value), value) for value in values)])
+        cells = [of(result) for of in columns.values()]
+        rows.append([(result.output, result.path), *((_cell_text(value), value) for value in cells)])
     errors = (
         html.table(("scene", "error"), [(result.path, result.error) for result in failed], words=(1,)) if failed else ""
     )
@@ -536,5 +538,5 @@ def make_batch_page(batch: Batch) -> str:
 
 
 def _cell_text(value: float | None) -> str:
-    """Return a number with at most one decimal; nothing if it is unknown."""
-    return "" if value is None else f"{value:,.1f}".removesuffix(".0")
+    """Return a number with at most one decimal; a dash if it is unknown, as seconds and PSNR of an earlier run are."""
+    return "–" if value is None else f"{value:,.1f}".removesuffix(".0")

@@ -64,7 +64,8 @@ def batch(
     except CommandLineError as error:
         raise typer.BadParameter(str(error)) from None
     counts = (f"{len(done.select(state))} {state.replace('_', ' ')}" for state in ("done", "done_before", "failed"))
-    out.publish(done.as_json(), f"{counted(len(done.results), 'scene')}: {', '.join(counts)}; {done.folder / PAGE}")
+    page = f"; {done.folder / PAGE}" if done.has_page else ""
+    out.publish(done.as_json(), f"{counted(len(done.results), 'scene')}: {', '.join(counts)}{page}")
     failed = done.select("failed")
     for result in failed[:_SHOWN_MAX]:
         note(f"failed: {result.path}: {result.error}")
