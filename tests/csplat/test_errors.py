@@ -62,7 +62,7 @@ def test_an_error_names_code_place_and_values_also_in_another_process(error, mes
     ("coordinate_system", "RLU", "the axes are 'RLU'"),
     ("unit_metres", 0.0, "unit_metres is 0.0"),
     ("unit_metres", float("inf"), "unit_metres is inf"),
-    ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
+    ("extra", {"id": np.zeros(9)}, "extra column 'id' has shape .9,., expected .10,."),
     ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
 ])  # fmt: skip
 def test_invalid_fields_are_refused(make_model, field, value, message):

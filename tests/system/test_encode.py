@@ -32,7 +32,7 @@ import csplat
 from csplat import Context, decode, write_ply
 from csplat.ply import read_ply
 from csplat_tools.cli.app import app
-from csplat_tools.encode_file import describe_first_picture, encode_file
+from csplat_tools.encode_file import describe_wait, encode_file
 from csplat_tools.present.viewer_server import SceneServer
 
 pytestmark = pytest.mark.usefixtures("no_first_view")
@@ -504,21 +504,21 @@ def test_a_large_scene_needs_little_memory_unless_levels_are_requested(make_mode
     assert cost == estimate("8GB", "--levels", "none")
 
 
-def test_a_first_picture_that_takes_long_is_reported_with_a_remedy(tmp_path, ply, monkeypatch):
+def test_a_long_wait_for_the_whole_scene_is_reported_with_a_remedy(tmp_path, ply, monkeypatch):
     out, page = tmp_path / "a.csplat", tmp_path / "a.html"
     short = csplat.read_header(csplat.encode(read_ply(ply)))
     header = replace(short, index_size=6_000_000)
     for found in (short, replace(header, coarse_tiles=header.tiles), replace(header, index_size=4_900_000)):
-        assert [] == describe_first_picture(found)
-    (line,), (page_line,) = describe_first_picture(header), describe_first_picture(short, 7_000_000)
-    assert line.startswith("the first picture takes 6.0 MB, 5 s at 10 Mbit/s; levels of detail avoid this (")
-    assert "takes 7.0 MB, 6 s at 10 Mbit/s; levels of detail in a page with `csplat export-element` avoid" in page_line
-    (line,) = describe_first_picture(replace(header, resource_level="B"))
-    assert "10 Mbit/s, and phones may refuse the file (resource level B); levels" in line
+        assert [] == describe_wait(found)
+    (line,), (page_line,) = describe_wait(header), describe_wait(short, 7_000_000)
+    assert line.startswith("the whole scene is seen after 6.0 MB, 5 s at 10 Mbit/s; with levels of detail, at once (")
+    assert "after 7.0 MB, 6 s at 10 Mbit/s; with levels of detail in a page with `csplat export-element`" in page_line
+    (line,) = describe_wait(replace(header, resource_level="B"))
+    assert "10 Mbit/s, and phones may refuse the file (resource level B); with levels" in line
 
     monkeypatch.setattr(SceneServer, "serve_forever", lambda *_, **__: None)
     for module in ("encode", "view"):
-        monkeypatch.setattr(f"csplat_tools.cli.{module}.describe_first_picture", lambda *_: ["a long wait"])
+        monkeypatch.setattr(f"csplat_tools.cli.{module}.describe_wait", lambda *_: ["a long wait"])
     for words in (("encode", ply, out), ("view", out, "--no-browser"), ("export-html", out, page)):
         done = call(*words, "--json")
         assert "a long wait" in done.stderr.splitlines()

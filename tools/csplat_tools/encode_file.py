@@ -41,8 +41,8 @@ def read_degree(options: EncodeOptions) -> int | None:
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
 
-def describe_first_picture(header: SceneHeader, page_bytes: int | None = None) -> list[str]:
-    """Format the wait for the first picture of a file without levels of detail, and what levels cost, as a line.
+def describe_wait(header: SceneHeader, page_bytes: int | None = None) -> list[str]:
+    """Format the wait for a picture of the whole scene, from a file without levels of detail, and what levels cost.
 
     Args:
         header: header of the file.
@@ -50,7 +50,7 @@ def describe_first_picture(header: SceneHeader, page_bytes: int | None = None) -
             scene when the geometry of all tiles is here.
 
     Returns:
-        The line, in a list; nothing if the file has levels, or its first picture does not take long.
+        The line, in a list; nothing if the file has levels, or the wait is short.
     """
     geometry = sum(tile.layers[_spec.LAYER_GEOMETRY].size for tile in header.tiles)
     size = _spec.HEADER_SIZE + header.index_size + geometry if page_bytes is None else page_bytes
@@ -61,9 +61,9 @@ def describe_first_picture(header: SceneHeader, page_bytes: int | None = None) -
     phones = "" if is_phones else f", and phones may refuse the file (resource level {level})"
     place = "" if page_bytes is None else " in a page with `csplat export-element`"
     time = format_estimate(FittedLevelBuilder(fits=False).seconds(header.splat_count, DEFAULT_CONTEXT.thread_count))
-    wait = f"the first picture takes {format_bytes(size)}, {seconds:.0f} s at {_LINE_MBITS} Mbit/s{phones}"
+    wait = f"the whole scene is seen after {format_bytes(size)}, {seconds:.0f} s at {_LINE_MBITS} Mbit/s{phones}"
     price = f"`csplat encode --levels merged`: about {time} more, a third more bytes"
-    return [f"{wait}; levels of detail{place} avoid this ({price})"]
+    return [f"{wait}; with levels of detail{place}, at once ({price})"]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
-    describe_first_picture,
+    describe_wait,
     encode_file,
     format_cost,
     format_encoding,
@@ -195,7 +195,7 @@ def _publish_encoded(encoded: EncodedFile, source: str, output: str, out: Output
         out.remark(f"{shared.describe_estimated_up(metadata.up)}, and stored as such: --up sets another")
     out.remark(*format_encoding(encoded, source, output))
     data = encoded.result.content
-    out.remark(*describe_first_picture(read_header(output if data is None else data)))
+    out.remark(*describe_wait(read_header(output if data is None else data)))
     out.publish(encoded.as_json())
 
 

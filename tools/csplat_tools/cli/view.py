@@ -18,7 +18,7 @@ from csplat.errors import counted
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import format_bytes, note
-from csplat_tools.encode_file import describe_first_picture
+from csplat_tools.encode_file import describe_wait
 from csplat_tools.file_streams import check_name, write_bytes
 from csplat_tools.present import viewer_page
 from csplat_tools.present.viewer_server import (
@@ -75,7 +75,7 @@ def view(
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.print_findings(scene.findings)
-            out.remark(*_encoding_lines(scene, _PRESETS[0]), *describe_first_picture(scene.header))
+            out.remark(*_encoding_lines(scene, _PRESETS[0]), *describe_wait(scene.header))
             out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
             out.remark("Ctrl-C ends this.")
@@ -128,7 +128,7 @@ def export_html(
     out.remark(
         f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
         f" (its file and a third), page and decoder {format_bytes(exported.code_bytes)}",
-        *describe_first_picture(scene.header, len(exported.page)),
+        *describe_wait(scene.header, len(exported.page)),
     )
     sizes = {"scene_bytes": exported.scene_bytes, "code_bytes": exported.code_bytes}
     out.publish({"splats": scene.header.splat_count, "size_bytes": len(exported.page), **sizes})
