@@ -5,7 +5,7 @@
 #
 #   tools/release/strangers.sh [SUITE[:USER[:COMPILER]]...]    such as trixie, sid:root:none, bookworm:user:g++
 #
-# What is committed is tested. Systems, logs and the table are kept in out/strangers.
+# What is committed is tested. Systems and logs are kept in out/strangers; two calls may run side by side.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 work=$PWD/out/strangers
@@ -34,9 +34,9 @@ install_lines() {
     awk '/^## Install/ { found = 1 } found && /^```$/ { exit } inside; found && /^```sh/ { inside = 1 }' README.md
 }
 
-# follow SUITE USER COMPILER: run the lines in a copy of the system; print a row of the table.
+# follow SUITE USER COMPILER: run the lines in a copy of the system, print a row of the table, and count failures.
 follow() {
-    local root=$work/machine home=/root log=$work/logs/$1-$2-$3.log lines base
+    local root=$work/machine-$1-$2-$3 home=/root log=$work/logs/$1-$2-$3.log lines base row
     rm -rf "$root"
     base=$(system "$1" "$3")
     cp -a --reflink=auto "$base" "$root"
@@ -71,16 +71,16 @@ SCRIPT
         mount -t devpts -o newinstance,ptmxmode=0666 devpts "$1/dev/pts"
         exec chroot "$1" runuser -u "$2" -- env -i HOME="$3" PATH=/usr/local/bin:/usr/bin:/bin bash "$3/follow.sh"
     ' - "$root" "$2" "$home" </dev/null >"$log" 2>&1 || true
-    printf '%s\t%s\t%s\t%s\t%s\n' "$1" "$(chroot "$root" python3 --version)" "$2" "$3" "$(cat "$root/tmp/row")" |
-        tee -a "$work/table"
+    row=$(cat "$root/tmp/row")
+    printf '%s\t%s\t%s\t%s\t%s\n' "$1" "$(chroot "$root" python3 --version)" "$2" "$3" "$row"
+    case $row in *FAILED*) failures=$((failures + 1)) ;; esac
+    rm -rf "$root"
 }
 
 [ $# -gt 0 ] || set -- bookworm trixie sid
-rm -f "$work/table"
-{
-    printf 'Debian\tPython\tuser\tcompiler\t'
-    install_lines | sed -E 's/ {2,}#.*//' | paste -sd '\t'
-} | tee "$work/table"
+failures=0
+printf 'Debian\tPython\tuser\tcompiler\t'
+install_lines | sed -E 's/ {2,}#.*//' | paste -sd '\t'
 for machine; do
     IFS=: read -r suite user compiler <<<"$machine"
     for user in ${user:-root user}; do
@@ -89,4 +89,4 @@ for machine; do
         done
     done
 done
-! grep -q FAILED "$work/table"
+[ $failures = 0 ]
