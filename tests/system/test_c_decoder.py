@@ -188,7 +188,7 @@ def test_a_project_of_cmake_finds_the_library(tmp_path, options, zlib):
     assert (0, "") == (told.returncode, told.stderr)
     alias.mkdir()
     shutil.copy(C / "example.c", alias / "main.c")
-    inside = re.sub("find_package.*", f"add_subdirectory({C} c)", lines)
+    inside = re.sub("find_package.*", f'add_subdirectory("{C}" c)', lines)
     (alias / "CMakeLists.txt").write_text(head + inside, "utf-8")
     cmake("-S", alias, "-B", alias, *options)  # a name with :: that is no target is an error
 
