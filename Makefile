@@ -26,7 +26,7 @@ NATIVE := trainer/csplat_render/native/build.py
 help: ## this list
 	@grep -E '^[a-z%-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
 
-demo: $(CORE) ## set up, then encode, verify and decode the sample scene
+demo: $(CORE) ## install this clone into .venv, editable; encode, verify and decode the sample scene
 	@mkdir -p out
 	$(BIN)/csplat encode $(SAMPLE) out/sample.csplat --force
 	$(BIN)/csplat verify out/sample.csplat

@@ -162,9 +162,8 @@ def test_the_lines_of_the_page_run(tmp_path):
 
 @pytest.mark.parametrize(("options", "zlib"), [
     (["-DBUILD_SHARED_LIBS=OFF"], True),
-    (["-DBUILD_SHARED_LIBS=OFF", "-DCSPLAT_ZLIB=OFF"], False),
     (["-DBUILD_SHARED_LIBS=ON", "-DCMAKE_DISABLE_FIND_PACKAGE_ZLIB=ON"], False),
-], ids=["zlib", "switched off", "absent"])  # fmt: skip
+], ids=["zlib", "absent"])  # fmt: skip
 def test_a_project_of_cmake_finds_the_library(tmp_path, options, zlib):
     if shutil.which("cmake") is None:
         absent("there is no cmake")
