@@ -11,7 +11,9 @@ from tables import failures
 from csplat.errors import InputError
 from csplat_render.camera import intrinsics, look_at, orbit
 from csplat_render.camera_paths import _best_arc, orbit_cameras
+from csplat_render.first_view import first_view
 from csplat_render.scene_frame import scene_frame
+from csplat_render.up_estimate import estimate_up
 from csplat_render.virtual_cameras import virtual_cameras
 
 SMALL_K = intrinsics(64, 48, 60.0)
@@ -40,6 +42,16 @@ def test_an_orbit_goes_around_the_recorded_up(up):
     assert np.ptp([camera.position @ np.array(up) for camera in cameras]) < 1e-5
     assert np.abs(right).max() < 1e-5
     assert down.max() < -0.9
+
+
+@pytest.mark.slow
+def test_an_orbit_of_unknown_up_is_upright_where_the_first_view_is():
+    rows = np.random.default_rng(0).standard_normal((2000, 3))
+    disc = cloud(rows / np.linalg.norm(rows, axis=1, keepdims=True) * (1.0, 1.0, 0.3))
+    assert estimate_up(disc) is None
+    for camera in (first_view(disc), *orbit_cameras(disc, 4, 64, 48)):
+        assert camera.viewmat[1, 1] > 0.9  # images have y, as the scene, downwards
+        assert abs(camera.viewmat[0, 1]) < 1e-6
 
 
 @pytest.mark.slow

@@ -351,6 +351,7 @@ def test_the_number_of_dropped_floaters_is_reported_apart_from_a_crop(tmp_path):
     result = json.loads(made.stdout)
     assert (3003, 2, 3000) == (result["source_splats"], result["floaters"], result["splats"])
     assert "--drop-floaters: 2 of 3,002 splats dropped" in made.stderr
+    assert "--crop: 1 of 3,003 splats dropped" in made.stderr
     assert f"--crop: along x, y, z as {tmp_path / 'in.ply'} stores them" in made.stderr
 
 

@@ -147,7 +147,7 @@ def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
     views = ("--data", "my set", "--json")
     words = ("--what", "presets=fast,targets=3kB", "--with", "spz", "--page", "page.html")
     done = call("tradeoff", "my set/scene.ply", *views, *words)
-    assert "2/4 targets=3kB: " in done.stderr
+    assert "4/4 targets=3kB: " in done.stderr
     assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
     rows = json.loads(done.stdout)["points"]
     assert {"presets=fast", "targets=3kB", "spz", "spz=small"} == {row["name"] for row in rows}

@@ -513,6 +513,8 @@ def test_a_long_wait_for_the_whole_scene_is_reported_with_a_remedy(tmp_path, ply
     (line,), (page_line,) = describe_wait(header), describe_wait(short, 7_000_000)
     assert line.startswith("the whole scene is seen after 6.0 MB, 5 s at 10 Mbit/s; with levels of detail, at once (")
     assert "after 7.0 MB, 6 s at 10 Mbit/s; with levels of detail in a page with `csplat export-element`" in page_line
+    (line,) = describe_wait(replace(short, coarse_tiles=short.tiles), 9)
+    assert "levels of detail only add to it" in line
     (line,) = describe_wait(replace(header, resource_level="B"))
     assert "10 Mbit/s, and phones may refuse the file (resource level B); with levels" in line
 

@@ -50,11 +50,13 @@ def describe_wait(header: SceneHeader, page_bytes: int | None = None) -> list[st
             scene when the geometry of all tiles is here.
 
     Returns:
-        The line, in a list; nothing if the file has levels, or the wait is short.
+        The line, in a list; nothing if viewers use levels, or the wait is short.
     """
     geometry = sum(tile.layers[_spec.LAYER_GEOMETRY].size for tile in header.tiles)
     size = _spec.HEADER_SIZE + header.index_size + geometry if page_bytes is None else page_bytes
     seconds, level = 8e-6 * size / _LINE_MBITS, header.resource_level
+    if header.coarse_tiles and page_bytes is not None:
+        return ["the page is drawn when all of it is here: levels of detail only add to it; an element uses them"]
     if header.coarse_tiles or seconds < _SLOW_SECONDS:
         return []
     is_phones = level == _spec.RESOURCE_LEVEL_NAMES[_spec.RESOURCE_LEVEL_A]

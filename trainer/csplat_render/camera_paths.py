@@ -21,7 +21,7 @@ from csplat.model import SplatModel
 from csplat.scene_metadata import ESTIMATE, VIEW
 from csplat.types import F64, Mask
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
-from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
+from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, viewing_frame
 from csplat_render.up_estimate import with_estimated_up
 from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING
 
@@ -78,7 +78,7 @@ def orbit_cameras(
     """
     if count < 1:
         raise InputError(f"an orbit of {count} cameras, expected at least 1")
-    frame, K = scene_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
+    frame, K = viewing_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
         along = [Camera.from_json(entry) for entry in model.metadata.cameras or ()]
     if along:

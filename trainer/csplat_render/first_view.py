@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from csplat.scene_metadata import ESTIMATE, TRAINED, UNSPECIFIED, VIEW, SceneMet
 from csplat.types import F64
 from csplat_render.camera import Camera, central_camera, direction_at, intrinsics, look_at
 from csplat_render.camera_paths import ELEVATION, main_parts, orbit_framing
-from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
+from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, viewing_frame
 from csplat_render.up_estimate import POINTS_PER_SPLAT, estimate_up
 from csplat_render.virtual_cameras import HIDING
 
@@ -30,7 +29,6 @@ from csplat_render.virtual_cameras import HIDING
 SAMPLE_SPLATS = 50_000
 
 _POINTS = 16_000  # cloud points, but at most POINTS_PER_SPLAT for each splat
-_USUAL_UP = (0.0, -1.0, 0.0)  # what viewers assume of scenes of unknown axes
 _FIELD_OF_VIEW = 50.0  # degrees, of a square image: viewers fit all of it into their canvas, wide or tall
 _SIDE = 640  # pixels of the image's side
 _TURNS = 24  # number of azimuths to try
@@ -74,9 +72,7 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     metadata = model.metadata.with_up(estimate_up(model, every), estimated=True)
     if VIEW in metadata.entries or not len(model):
         return metadata
-    frame = scene_frame(model.with_metadata(metadata))
-    if metadata.up is None:
-        frame = replace(frame, up=np.array(_USUAL_UP))
+    frame = viewing_frame(model.with_metadata(metadata))
     known = [] if frame.kind == "object" else cameras or _cameras_of(metadata)
     if known:
         return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))

@@ -11,7 +11,7 @@ do not use BLAS, so no result depends on the number of threads.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -30,6 +30,7 @@ _FAR_SHARE = 0.02  # fraction of the surface; if more is outside this radius, th
 _BOX_QUANTILES = (0.05, 0.5, 0.95)  # quantiles of opacity along an axis: the box's ends and its middle
 _AREA_REACH = 0.5  # side of the largest area of a splat that counts, in radii that contain half the opacity
 _SINGLE_EXTENT = 3.0  # extent of splats at a single position, in standard deviations of the largest
+_USUAL_UP = (0.0, -1.0, 0.0)  # what viewers assume of scenes of unknown axes
 _FLAT = 0.6  # ratio of the shortest extent to the next; if it is smaller, the short axis points up
 
 Kind = Literal["object", "surrounding"]
@@ -100,6 +101,12 @@ def scene_frame(model: SplatModel) -> SceneFrame:
     if extent <= 0.0:  # a single position
         extent = _SINGLE_EXTENT * float(np.sqrt(np.max(areas[alpha > 0.0]) / (2.0 * np.pi)))
     return SceneFrame("object", (low + high) / 2.0, extent, up)
+
+
+def viewing_frame(model: SplatModel) -> SceneFrame:
+    """Return the frame of a scene for viewers, which assume −y of an unknown up direction."""
+    frame = scene_frame(model)
+    return frame if model.metadata.up is not None else replace(frame, up=np.array(_USUAL_UP))
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,6 +64,8 @@ def batch(
     except CommandLineError as error:
         raise typer.BadParameter(str(error)) from None
     counts = (f"{len(done.select(state))} {state.replace('_', ' ')}" for state in ("done", "done_before", "failed"))
+    if done.select("done_before"):
+        out.remark("scenes done before keep their files: --force repeats them, for instance with other options")
     page = f"; {done.folder / PAGE}" if done.has_page else ""
     out.publish(done.as_json(), f"{counted(len(done.results), 'scene')}: {', '.join(counts)}{page}")
     failed = done.select("failed")

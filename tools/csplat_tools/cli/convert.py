@@ -124,6 +124,9 @@ def convert(
     if made.lost_words():
         note(f"lost on the way: {made.lost_words()}")
     out.print_findings(made.losses)
+    if crop is not None:
+        cropped = made.source_count - made.floater_count - made.count
+        out.remark(f"--crop: {cropped:,} of {counted(made.source_count, 'splat')} dropped")
     if drop_floaters:
         out.remark(
             f"--drop-floaters: {made.floater_count:,} of {counted(made.floater_count + made.count, 'splat')} dropped"
@@ -150,7 +153,7 @@ def _filter_axes(source: str, made: Conversion, *, chosen: bool) -> str:
     if chosen:
         return f"the axes x, y, z = {made.filter_axes} of --to-axes"
     if made.filter_axes == UNSPECIFIED:
-        return f"x, y, z as {source} stores them; it does not state which way they point: --axes does"
+        return f"x, y, z as {source} stores them, without stating which of them is up"
     return f"the axes of {source}, x, y, z = {made.filter_axes}; --to-axes chooses others"
 
 

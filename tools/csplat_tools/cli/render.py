@@ -34,7 +34,9 @@ def render(
     data: Annotated[str | None, typer.Option(metavar="DATA", help="Cameras of a data set's test images.")] = None,
     background: shared.Background = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Pixels. Default: cameras', or 640x480.")] = None,
-    up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Axis of --orbit. Default: the scene's.")] = None,
+    up: Annotated[
+        str | None, typer.Option(metavar="-y|X,Y,Z", help="Up, for --orbit. Default: scene's, or -y.")
+    ] = None,
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras around or along. Default: none.")
     ] = None,
@@ -99,7 +101,9 @@ def render(
         out.remark(*notes)
         if orbit is not None and not out.quiet:
             axis = estimate_up(to_frame)
-            if axis is not None:
+            if axis is None and to_frame.metadata.up is None and cameras is None:
+                out.remark("the scene does not state which way is up: -y is assumed; --up sets another")
+            elif axis is not None:
                 out.remark(f"{shared.describe_estimated_up(axis)}, and used (encode --up writes it into a file)")
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(

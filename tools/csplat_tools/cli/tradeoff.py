@@ -54,8 +54,8 @@ def tradeoff(
     from csplat_tools.tradeoffs import GROUPS, format_tradeoff, make_tradeoff_page, parse_formats, parse_grid
 
     out, views = Output(force, report, as_json, quiet), shared.ViewOptions(cameras, data)
-    grid = shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
-    grid += [] if with_ is None else shared.checked(parse_formats, with_)
+    grid = [] if with_ is None else shared.checked(parse_formats, with_)  # first, since they take seconds
+    grid += shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
     searches = [(setting.options, setting.target) for setting in grid if setting.target is not None]
     out.check(inputs=(source, *views.inputs), named={"--page": page})
     require_renderer()
