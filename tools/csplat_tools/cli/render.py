@@ -99,17 +99,17 @@ def render(
         data_set = None if data is None else shared.open_data(data, size=pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
-        if orbit is not None and not out.quiet:
-            axis = estimate_up(to_frame)
-            if axis is None and to_frame.metadata.up is None and cameras is None:
-                out.remark("the scene does not state which way is up: -y is assumed; --up sets another")
-            elif axis is not None:
-                out.remark(f"{shared.describe_estimated_up(axis)}, and used (encode --up writes it into a file)")
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,
             context=Context(progress=progress),
         )  # fmt: skip
+    if orbit is not None and not out.quiet:
+        axis = estimate_up(to_frame)
+        if axis is not None:
+            out.remark(f"{shared.describe_estimated_up(axis)}, and used (encode --up writes it into a file)")
+        elif to_frame.metadata.up is None and cameras is None:
+            out.remark("the scene does not state which way is up: -y is assumed; --up sets another")
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")
     out.remark(
