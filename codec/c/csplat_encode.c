@@ -371,11 +371,21 @@ typedef struct view {
     uint32_t count, stride; /* row i is rows[i * stride], or i * stride */
 } view;
 
+enum { PARTS_MAX = 32 };
+
+/* Splats that are far from all others. */
+typedef struct scene_part {
+    double centre[3], square; /* of a sphere that contains them; its squared radius */
+    int octaves;              /* <= 0, the steps of their means are the file's times 2^octaves */
+} scene_part;
+
 /* Steps, levels and codings of the file. */
 typedef struct parameters {
     double means, scales, sh0, sh, codebook_sh;
     int32_t opacity_levels, quat_levels;
     int uses_codebook;
+    scene_part parts[PARTS_MAX + 1]; /* the last of `part_count` + 1 stands for the rest; none if `part_count` is 0 */
+    unsigned part_count;
 } parameters;
 
 typedef struct part {
@@ -780,8 +790,12 @@ static uint64_t morton_code(const uint64_t q[3])
 
 enum { STATISTICS_SAMPLE = 1 << 16, NEIGHBOUR_DISTANCE = 8, RUNS = 16 };
 
+enum { PART_SAMPLE = 1 << 11, PART_CENTRES = 64, PART_MIN = 20 };
+
 typedef struct statistics {
     double reach, contrast, size;
+    scene_part parts[PARTS_MAX + 1];
+    unsigned part_count;
 } statistics;
 
 static inline uint32_t row_of(const view *v, uint32_t i)
@@ -931,26 +945,147 @@ static double contrast_of(double squares, double weights)
     return weights > 0.0 ? 0.28209479177387814 * sqrt(squares / weights) : 0.2;
 }
 
+static double square_distance(const double *point, const double *centre)
+{
+    double square = 0.0;
+    for (int axis = 0; axis < 3; axis++) {
+        double distance = point[axis] - centre[axis], product = distance * distance;
+        square += product;
+    }
+    return square;
+}
+
+/* Return the first part that contains a mean, or `count`. */
+static unsigned part_of(const scene_part *parts, unsigned count, const float *mean)
+{
+    double point[3] = {mean[0], mean[1], mean[2]};
+    for (unsigned i = 0; i < count; i++)
+        if (square_distance(point, parts[i].centre) <= parts[i].square)
+            return i;
+    return count;
+}
+
+/* Return the minimum number of splats of a part in a sample. */
+static uint32_t part_least(uint32_t count)
+{
+    uint32_t share = (uint32_t)((double)count * 0.01);
+    return share > PART_MIN ? share : PART_MIN;
+}
+
+/* Find the parts of a scene between which there is much more space than within them (coding_parameters.find_parts). */
+static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigned *part_count)
+{
+    view few = thin_out(sample, PART_SAMPLE);
+    uint32_t count = few.count, least = part_least(count), kept;
+    double *points, *squares, *best;
+    unsigned found = 0;
+    TRY(points = get(e, 3 * (uint64_t)count, sizeof *points));
+    TRY(squares = get(e, count, sizeof *squares));
+    TRY(best = get(e, count, sizeof *best));
+    for (uint32_t i = 0; i < count; i++)
+        for (uint32_t axis = 0; axis < 3; axis++)
+            points[3 * (size_t)i + axis] = e->in->means[3 * (size_t)row_of(&few, i) + axis];
+    while (count >= 2 * least && found < PARTS_MAX) {
+        uint32_t step = count / PART_CENTRES ? count / PART_CENTRES : 1, slack = (uint32_t)((double)count * 0.01);
+        double widest = 0.0, *centre = parts[found].centre;
+        slack = slack ? slack : 1;
+        for (uint32_t k = 0; k < count; k += step) {
+            for (uint32_t i = 0; i < count; i++)
+                squares[i] = square_distance(points + 3 * (size_t)i, points + 3 * (size_t)k);
+            TRY(sort_doubles(e, squares, count));
+            if (k == 0 || squares[least - 1] < best[least - 1]) {
+                memcpy(best, squares, count * sizeof *best);
+                memcpy(centre, points + 3 * (size_t)k, 3 * sizeof *centre);
+            }
+        }
+        for (uint32_t i = least - 1; i + slack < count; i++) {
+            double ratio = best[i] > 0.0 ? best[i + slack] / best[i] : 0.0;
+            if (ratio > widest) {
+                widest = ratio;
+                parts[found].square = best[i] * 3.0;
+            }
+        }
+        if (widest < 9.0)
+            break;
+        kept = 0;
+        for (uint32_t i = 0; i < count; i++)
+            if (square_distance(points + 3 * (size_t)i, centre) > parts[found].square) {
+                memmove(points + 3 * (size_t)kept, points + 3 * (size_t)i, 3 * sizeof *points);
+                kept++;
+            }
+        count = kept;
+        found++;
+    }
+    *part_count = found > 1 || count >= least ? found : 0;
+    drop(e, best);
+    drop(e, squares);
+    drop(e, points);
+    return 1;
+}
+
+/* Collect the rows of a view that are in a part, in their order. */
+static uint32_t rows_of_part(const encoder *e, const view *v, const statistics *s, unsigned part, uint32_t *rows)
+{
+    uint32_t count = 0;
+    for (uint32_t i = 0; i < v->count; i++) {
+        uint32_t row = row_of(v, i);
+        if (part_of(s->parts, s->part_count, e->in->means + 3 * (size_t)row) == part)
+            rows[count++] = row;
+    }
+    return count;
+}
+
 /* Measure a scene; `contrast` is negative unless it is known. */
 static int measure_scene(encoder *e, const view *v, double contrast, statistics *s)
 {
-    double centre[3], squares, weights, *sizes, size;
     view sample = thin_out(v, STATISTICS_SAMPLE);
-    TRY(find_reach(e, v, centre, &s->reach));
-    TRY(sizes = get(e, sample.count, sizeof *sizes));
-    for (uint32_t i = 0; i < sample.count; i++) {
-        const float *scales = e->scales + 3 * (size_t)row_of(&sample, i);
-        sizes[i] = larger(larger(scales[0], scales[1]), scales[2]);
+    double centre[3], reaches[PARTS_MAX + 1], total[2] = {0.0, 0.0}, *sizes, size = 0.0;
+    uint32_t *rows, main = 0, count = 0;
+    TRY(find_parts(e, &sample, s->parts, &s->part_count));
+    TRY(rows = get(e, v->count, sizeof *rows));
+    s->reach = 0.0;
+    for (unsigned k = 0; k <= s->part_count; k++) {
+        view part = {rows, rows_of_part(e, &sample, s, k, rows), 1};
+        reaches[k] = 0.0;
+        if (!part.count)
+            continue;
+        TRY(find_reach(e, &part, centre, &reaches[k]));
+        if (part.count > main) {
+            main = part.count;
+            TRY(sizes = get(e, main, sizeof *sizes));
+            for (uint32_t i = 0; i < main; i++) {
+                const float *scales = e->scales + 3 * (size_t)rows[i];
+                sizes[i] = larger(larger(scales[0], scales[1]), scales[2]);
+            }
+            TRY(sort_doubles(e, sizes, main));
+            size = main % 2 ? sizes[main / 2] : ((float)sizes[(main - 1) / 2] + (float)sizes[main / 2]) / 2.0f;
+            drop(e, sizes);
+            size = csplat_exp(clip(size, -80.0, 80.0));
+            size = reaches[k] > 0.0 ? size / reaches[k] : 1.0;
+        }
+        count = part.count;
     }
-    TRY(sort_doubles(e, sizes, sample.count));
-    size = sample.count % 2 ? sizes[sample.count / 2]
-                            : ((float)sizes[(sample.count - 1) / 2] + (float)sizes[sample.count / 2]) / 2.0f;
-    drop(e, sizes);
-    size = s->reach > 0.0 ? csplat_exp(clip(size, -80.0, 80.0)) / s->reach : 1.0;
-    if (contrast < 0.0) {
-        TRY(sum_contrast(e, v, centre, s->reach, &squares, &weights));
-        contrast = contrast_of(squares, weights);
+    if (s->part_count && count < part_least(sample.count)) /* outliers */
+        reaches[s->part_count] = 0.0;
+    for (unsigned k = 0; k <= s->part_count; k++)
+        s->reach = larger(s->reach, reaches[k]);
+    for (unsigned k = 0; k <= s->part_count; k++) {
+        double ratio = reaches[k] > 0.0 ? s->reach / reaches[k] * sqrt(0.5) : 1.0;
+        int octaves = ceil_log2(ratio);
+        s->parts[k].octaves = octaves > 0 ? -octaves : 0;
     }
+    for (unsigned k = 0; contrast < 0.0 && k <= s->part_count; k++) {
+        view part = {rows, rows_of_part(e, v, s, k, rows), 1};
+        double reach, sums[2];
+        if (!part.count)
+            continue;
+        TRY(find_reach(e, &part, centre, &reach));
+        TRY(sum_contrast(e, &part, centre, reach, &sums[0], &sums[1]));
+        total[0] += sums[0];
+        total[1] += sums[1];
+    }
+    contrast = contrast < 0.0 ? contrast_of(total[0], total[1]) : contrast;
+    drop(e, rows);
     s->contrast = clip(contrast, 0.02, 1.0);
     s->size = clip(size, 1e-4, 1.0);
     return 1;
@@ -1002,9 +1137,10 @@ static double source_step(const float *values, const view *v, double step)
     return grid;
 }
 
-/* Choose the step of the means. */
-static int choose_lattice(encoder *e, const view *v, double by_quality, double *step)
+/* Choose the step of the means, and the parts with steps of their own. */
+static int choose_lattice(encoder *e, const view *v, double by_quality, const statistics *s)
 {
+    parameters *p = &e->p;
     view sample = thin_out(v, STATISTICS_SAMPLE);
     double *values, extent = 0.0, whole = 0.0, reach = 0.0;
     uint32_t edge = (uint32_t)((double)sample.count * 0.02);
@@ -1022,10 +1158,12 @@ static int choose_lattice(encoder *e, const view *v, double by_quality, double *
     }
     drop(e, values);
     extent = extent > 0.0 ? extent : whole;
-    *step = source_step(e->in->means, v, by_quality > 0.0 ? by_quality : extent / 65536.0);
-    *step = larger(*step, reach * 0x1p-40);
-    if (!(*step > 1e-250) || isinf(*step))
-        *step = 1.0;
+    by_quality = by_quality > 0.0 ? by_quality : extent / 65536.0;
+    p->means = larger(source_step(e->in->means, v, by_quality), reach * 0x1p-40);
+    if (!(p->means > 1e-250) || isinf(p->means))
+        p->means = 1.0;
+    p->part_count = p->means == by_quality ? s->part_count : 0; /* else a grid has all means, or the step is the finest */
+    memcpy(p->parts, s->parts, sizeof p->parts);
     return 1;
 }
 
@@ -1033,7 +1171,7 @@ static int choose_lattice(encoder *e, const view *v, double by_quality, double *
 static int choose_parameters(encoder *e, const view *v, double contrast)
 {
     parameters *p = &e->p;
-    statistics s = {0.0, 0.2, 0.01};
+    statistics s = {0.0, 0.2, 0.01, {{{0.0, 0.0, 0.0}, 0.0, 0}}, 0};
     int has_sh = e->degree > 0;
     double quality = has_sh ? 55.0 : 63.5, for_quats = has_sh ? 0.0 : -1.5, for_sh0 = has_sh ? -2.0 : 2.5;
     double step, sh;
@@ -1045,7 +1183,7 @@ static int choose_parameters(encoder *e, const view *v, double contrast)
     step = 2.2e-4 * coarse(quality) * s.reach / s.contrast;
     p->means = 1.0;
     if (v->count)
-        TRY(choose_lattice(e, v, step, &p->means));
+        TRY(choose_lattice(e, v, step, &s));
     step = 0.04 * coarse(quality) / s.contrast;
     p->scales = (float)source_step(e->scales, v, step < 0.5 ? step : 0.5);
     p->sh0 = (float)(0.07 * coarse(quality + for_sh0));
@@ -1130,8 +1268,9 @@ static uint32_t halve(encoder *e, span whole, int axis, double low, double exten
 }
 
 /* Cut a span of `order` into tiles by k-d medians, and halve the box of tiles that are too wide for the lattice. */
-static int cut_tiles(encoder *e, span whole, item *items, item *spare)
+static int cut_tiles(encoder *e, span whole, int octaves, item *items, item *spare)
 {
+    const double step = ldexp(e->p.means, octaves);
     uint32_t depth = 0, room = 128;
     span *pending;
     TRY(pending = get(e, room, sizeof *pending));
@@ -1154,12 +1293,12 @@ static int cut_tiles(encoder *e, span whole, item *items, item *spare)
             reach = larger(reach, larger(fabs(low[a]), fabs(high[a])));
         }
         extent = high[axis] - low[axis];
-        int is_wide = extent / e->p.means > (double)((1 << BITS) - 1) && current.count > OWN_TILE_MIN;
+        int is_wide = extent / step > (double)((1 << BITS) - 1) && current.count > OWN_TILE_MIN;
         if (!is_wide && current.count <= tile_limit(e)) {
-            int needed = exponent_of(extent / e->p.means / ((1 << BITS) - 2));
-            int finest = exponent_of(reach / e->p.means / 0x1p45); /* float resolves 2^24 */
+            int needed = exponent_of(extent / step / ((1 << BITS) - 2));
+            int finest = exponent_of(reach / step / 0x1p45); /* float resolves 2^24 */
             int exponent = needed > finest ? needed : finest;
-            TRY(add_part(e, current.start, current.count, exponent > 0 ? exponent : 0));
+            TRY(add_part(e, current.start, current.count, (exponent > 0 ? exponent : 0) + octaves));
             continue;
         }
         uint32_t near = halve(e, current, axis, low[axis], extent, is_wide ? NULL : items, spare);
@@ -1189,29 +1328,30 @@ static int exceeds(const float *values, unsigned count, double limit)
     return 0;
 }
 
-/* Cut the span of a bucket: splats with outliers in the same attributes share tiles, after the others. */
-static int cut_bucket(encoder *e, span whole, const uint8_t *flags, item *items, item *spare)
+/* Cut the span of a bucket: splats of each group share tiles. `groups` is NULL if there is only one. */
+static int cut_bucket(encoder *e, span whole, const uint16_t *groups, item *items, item *spare)
 {
+    const unsigned parts = e->p.part_count + 1;
     uint32_t *apart = (uint32_t *)spare, *rows = e->order + whole.start;
-    if (!flags)
-        return cut_tiles(e, whole, items, spare);
+    if (!groups)
+        return cut_tiles(e, whole, 0, items, spare);
     span group = {whole.start, 0};
-    memcpy(items, rows, whole.count * sizeof *rows);
     memcpy(apart, rows, whole.count * sizeof *rows);
-    for (unsigned value = 0; value < 8; value++) { /* `apart` is not used before all groups are in their places */
+    for (unsigned value = 0; value < 8 * parts; value++) { /* `apart` is not used before all are in their places */
         for (uint32_t i = 0; i < whole.count; i++)
-            if (flags[apart[i]] == value)
+            if (groups[apart[i]] == value)
                 e->order[group.start + group.count++] = apart[i];
         group.start += group.count;
         group.count = 0;
     }
     for (uint32_t at = 0; at < whole.count;) {
         span same = {whole.start + at, 0};
-        while (at < whole.count && flags[rows[at]] == flags[e->order[same.start]]) {
+        unsigned value = groups[rows[at]];
+        while (at < whole.count && groups[rows[at]] == value) {
             same.count++;
             at++;
         }
-        TRY(cut_tiles(e, same, items, spare));
+        TRY(cut_tiles(e, same, parts > 1 ? e->p.parts[value % parts].octaves : 0, items, spare));
     }
     return 1;
 }
@@ -1220,24 +1360,25 @@ static int cut_bucket(encoder *e, span whole, const uint8_t *flags, item *items,
 static int cut_scene(encoder *e, const span *buckets, uint32_t bucket_count)
 {
     double sh_step = e->p.codebook_sh < e->p.sh ? e->p.codebook_sh : e->p.sh;
-    uint8_t *flags;
+    uint16_t *groups;
     item *items, *spare;
     int any = 0;
-    TRY(flags = get(e, e->in->count, 1));
+    TRY(groups = get(e, e->in->count, sizeof *groups));
     for (size_t i = 0; i < e->in->count; i++) {
-        flags[i] = (uint8_t)(exceeds(e->scales + 3 * i, 3, integer_most * e->p.scales) |
-                             exceeds(e->in->sh0 + 3 * i, 3, integer_most * e->p.sh0 / 2.0) << 1 |
-                             exceeds(e->in->shN + e->values * i, e->values, integer_most * sh_step / 2.0) << 2);
-        any |= flags[i];
+        unsigned flags = (unsigned)(exceeds(e->scales + 3 * i, 3, integer_most * e->p.scales) |
+                                    exceeds(e->in->sh0 + 3 * i, 3, integer_most * e->p.sh0 / 2.0) << 1 |
+                                    exceeds(e->in->shN + e->values * i, e->values, integer_most * sh_step / 2.0) << 2);
+        groups[i] = (uint16_t)(flags * (e->p.part_count + 1) + part_of(e->p.parts, e->p.part_count, e->in->means + 3 * i));
+        any |= groups[i];
     }
     TRY(items = get(e, e->in->count, sizeof *items));
     TRY(spare = get(e, e->in->count, sizeof *spare));
     e->part_count = 0;
     for (uint32_t i = 0; i < bucket_count; i++)
-        TRY(cut_bucket(e, buckets[i], any ? flags : NULL, items, spare));
+        TRY(cut_bucket(e, buckets[i], any ? groups : NULL, items, spare));
     drop(e, spare);
     drop(e, items);
-    drop(e, flags);
+    drop(e, groups);
     return 1;
 }
 

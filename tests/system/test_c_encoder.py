@@ -150,6 +150,18 @@ def test_cuts_the_same_tiles(library, sample):
         assert_like_python(library, replace(model, means=moved))
 
 
+def test_gives_the_same_steps_to_parts_far_from_each_other(library, sample):
+    rng, few = np.random.default_rng(4), sample.select(slice(0, 1500))
+    for parts in (2, 3, 7):
+        part = np.repeat(np.arange(parts), rng.integers(150, 1500, parts))
+        model = few.select(rng.integers(0, len(few), len(part)))
+        sizes, centres = np.exp(rng.uniform(-3.0, 3.0, parts)), rng.normal(0.0, 300.0, (parts, 3))
+        means = (model.means * sizes[part, None] + centres[part]).astype(np.float32)
+        scales = (model.scales + np.log(sizes[part, None])).astype(np.float32)
+        scales[::400] += np.float32(30.0)  # outliers
+        assert_like_python(library, replace(model, means=means, scales=scales))
+
+
 @in_depth
 def test_writes_the_same_integers_for_a_scene_of_several_buckets(library, sample):
     count = BUCKET_SPLATS + 20000

@@ -10,8 +10,8 @@ proportion to the splat's size on the screen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,14 @@ _STATISTICS_SAMPLE = 1 << 16  # splats
 _RUNS = 16  # runs of neighbours in the sample
 _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
 _COLOUR_DIFFERENCE_MAX = 10.0  # sh0; a larger difference is an outlier, and counts as this
-_CORE = 0.8  # fraction of the splats within the scene's reach
+_CORE = 0.8  # fraction of the splats within the reach of a scene or part
+_PART_SAMPLE = 1 << 11  # splats on which parts are found
+_PART_CENTRES = 64  # splats of the sample that may be the centre of a part
+_PART_MIN = 20  # splats of the sample; smaller parts are outliers
+_PART_SHARE = 0.01  # fraction of the sample, for a large sample
+_PARTS_MAX = 32
+_GAP = 3.0  # outer by inner radius of the empty space around a part; that of ten scenes in one piece is at most 2.9
+_GAP_SHARE = 0.01  # fraction of the sample that this space may contain
 _STEP_SHARE_MIN = 2.0**-40  # smallest step of the means, as a fraction of the reach of the scene's core
 _LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its exponential stays within float32
 _CONTRAST_DEFAULT = 0.2  # contrast of a scene without pairs of neighbours
@@ -49,6 +56,21 @@ _LEVELS_RANGE = (8, 255)  # opacity and rotation levels that the quality may cho
 _SCALE_STEP_MAX = 0.5  # log scale; largest step that the quality may choose
 _CODE_BITS = 16  # bits per axis of a Morton code
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
+
+
+@dataclass(frozen=True)
+class ScenePart:
+    """Splats that are far from all others, in comparison with their distances from each other.
+
+    Attributes:
+        centre: x, y, z, scene units.
+        square: squared radius of a sphere that contains them.
+        octaves: <= 0, the steps of their means are the file's times 2**octaves.
+    """
+
+    centre: tuple[float, float, float]
+    square: float
+    octaves: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,12 +83,21 @@ class Lattice:
         finest: tiles use all their bits instead of stopping at `step`; set if the caller specified bits.
         error: largest displacement of a mean, scene units, which tiles are split and made finer to keep, regardless of
             their number; `None`: as the step gives it.
+        parts: parts of the scene with steps of their own; a splat is in the first part whose sphere contains it.
+        rest_octaves: `octaves` of the splats that are in no part.
     """
 
     step: float
     bits: int
     finest: bool = False
     error: float | None = None
+    parts: tuple[ScenePart, ...] = ()
+    rest_octaves: int = 0
+
+    def octaves_of(self, means: F32) -> NDArray[np.int8]:
+        """Return log2 of the step of each splat relative to the file's, before its tile is known; means are [N, 3]."""
+        octaves = np.array([*(part.octaves for part in self.parts), self.rest_octaves], np.int8)
+        return octaves[part_of(means, self.parts)]
 
 
 @dataclass(frozen=True)
@@ -187,7 +218,7 @@ def choose_parameters(
     statistics = scene_statistics(model, contrast)
     steps = _steps(statistics, quality, sh_quality, has_sh=degree > 0)
     return CodingParameters(
-        lattice=_lattice(model, options, steps.means),
+        lattice=_lattice(model, options, steps.means, statistics),
         morton=options.means_coding != "axis",
         scale_step=_default_to(options.scale_step, _source_step(model.scales, steps.scales)),
         opacity_levels=_default_to(options.opacity_levels, steps.opacity_levels),
@@ -224,15 +255,21 @@ def band_slice(band: int) -> slice:
 class SceneStatistics:
     """Statistics of a scene.
 
+    The reach of splats is the radius around the median of their means that contains 80 % of them, scene units, >= 0.
+
     Attributes:
-        reach: radius around the median of the means that contains 80 % of the splats, scene units, >= 0.
+        reach: the largest reach of a part or of the rest, or that of the scene if it is in one piece.
         contrast: rms colour difference of neighbouring splats, weighted by their opacities, in [0.02, 1].
-        size: median of the largest standard deviation, as a fraction of the reach, in [1e-4, 1].
+        size: median of the largest standard deviation of the splats of the largest part, or of the rest if that is
+            larger, as a fraction of their reach, in [1e-4, 1].
+        parts, rest_octaves: see `Lattice`.
     """
 
     reach: float
     contrast: float
     size: float
+    parts: tuple[ScenePart, ...] = ()
+    rest_octaves: int = 0
 
 
 def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
@@ -244,24 +281,129 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     """
     if len(model) == 0:
         return SceneStatistics(reach=0.0, contrast=_CONTRAST_DEFAULT, size=0.01)
-    points, reach = _reach(model.means)
-    largest = np.take(model.scales, _sample_rows(len(model)), axis=0).max(axis=1)
-    size = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX)))) / reach if reach else 1.0
+    rows = _sample_rows(len(model))
+    points = np.take(model.means, rows, axis=0).astype(np.float64)
+    parts = find_parts(points)
+    index = part_of(points, parts)
+    reaches, counts = [], np.bincount(index, minlength=len(parts) + 1)
+    for number in range(len(parts) + 1):
+        reaches.append(_reach(points[index == number]) if counts[number] else 0.0)
+    main = int(np.argmax(counts))
+    largest = np.take(model.scales, rows[index == main], axis=0).max(axis=1)
+    size = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
+    size = size / reaches[main] if reaches[main] else 1.0
     if contrast is None:
-        contrast = _contrast(*_contrast_sums(model, points, reach))
-    return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
+        contrast = contrast_of(contrast_sums(part) for part in _split(model, parts))
+    if counts[-1] < _part_min(len(points)):  # outliers
+        reaches[-1] = 0.0
+    reach = max(reaches)
+    octaves = [-max(0, ceil_log2(reach / own * math.sqrt(0.5))) if own else 0 for own in reaches]
+    return SceneStatistics(
+        reach,
+        float(np.clip(contrast, 0.02, 1.0)),
+        float(np.clip(size, 1e-4, 1.0)),
+        tuple(replace(part, octaves=own) for part, own in zip(parts, octaves[:-1], strict=True)),
+        octaves[-1],
+    )
+
+
+def find_parts(points: F64) -> tuple[ScenePart, ...]:
+    """Find the parts of a scene between which there is much more space than within them.
+
+    The centre of a part is the splat, of a few, with the nearest neighbours. Around a part, the shell from its radius
+    to `_GAP` times that radius has hardly any splats.
+
+    Args:
+        points: [n, 3], means of a sample of the scene.
+
+    Returns:
+        The parts, of `octaves` 0; none if the scene is in one piece but for outliers.
+    """
+    rest = points[:: max(1, len(points) // _PART_SAMPLE)]
+    least = _part_min(len(rest))
+    parts: list[ScenePart] = []
+    while len(rest) >= 2 * least and len(parts) < _PARTS_MAX:
+        centres = rest[:: max(1, len(rest) // _PART_CENTRES)]
+        squares = np.stack([np.sort(_squares(rest, centre)) for centre in centres])
+        chosen = int(np.argmin(squares[:, least - 1]))
+        inner, slack = squares[chosen], max(1, int(len(rest) * _GAP_SHARE))
+        inner, outer = inner[least - 1 : -slack], inner[least - 1 + slack :]
+        ratios = np.divide(outer, inner, out=np.zeros_like(outer), where=inner > 0.0)
+        widest = int(np.argmax(ratios))
+        if ratios[widest] < _GAP**2:
+            break
+        x, y, z = map(float, centres[chosen])
+        parts.append(ScenePart((x, y, z), float(inner[widest]) * _GAP))
+        rest = rest[_squares(rest, centres[chosen]) > parts[-1].square]
+    return tuple(parts) if len(parts) > 1 or len(rest) >= least else ()
+
+
+def _part_min(count: int) -> int:
+    """Return the minimum number of splats of a part in a sample of `count` splats."""
+    return max(_PART_MIN, int(count * _PART_SHARE))
+
+
+def part_of(means: NDArray[Any], parts: Sequence[ScenePart]) -> NDArray[np.uint8]:
+    """Return the first part of `parts` that contains each of the means, [N, 3]; the number of parts if none does."""
+    index = np.full(len(means), len(parts), np.uint8)
+    for number in reversed(range(len(parts))):
+        centre = np.array(parts[number].centre)
+        for start in range(0, len(means), _STATISTICS_SAMPLE):
+            block = means[start : start + _STATISTICS_SAMPLE].astype(np.float64)
+            index[start : start + _STATISTICS_SAMPLE][_squares(block, centre) <= parts[number].square] = number
+    return index
+
+
+def _split(model: SplatModel, parts: Sequence[ScenePart]) -> Iterator[SplatModel]:
+    """Yield the splats of each part, and of the rest, without SH bands from 1 on."""
+    if not parts:
+        yield model
+        return
+    index = part_of(model.means, parts)
+    plain = replace(model, shN=model.shN[:, :0], extra={})
+    for number in range(len(parts) + 1):
+        yield plain.select(np.flatnonzero(index == number))
+
+
+def _squares(points: F64, centre: F64) -> F64:
+    """Return the squared distances of points, [n, 3], from a centre, [3]."""
+    x, y, z = (points - centre).T
+    squares: F64 = x * x + y * y + z * z
+    return squares
 
 
 def contrast_sums(part: SplatModel) -> tuple[float, float]:
-    """Return what `contrast_of` takes of a part of a scene that has all splats of its region."""
-    return _contrast_sums(part, *_reach(part.means)) if len(part) else (0.0, 0.0)
+    """Return what `contrast_of` takes of a part of a scene that has all splats of its region.
+
+    Returns:
+        Σ w d² and Σ w over pairs of splats `_NEIGHBOUR_DISTANCE` apart in Morton order, where d² is the mean over the
+        channels of the squared difference of sh0, and w the product of the opacities. Both sums are 0 for few splats,
+        or without an extent. In a large part, the pairs are a sample.
+    """
+    squares, weights = 0.0, 0.0
+    if len(part) <= _NEIGHBOUR_DISTANCE:
+        return squares, weights
+    points = np.take(part.means, _sample_rows(len(part)), axis=0).astype(np.float64)
+    reach = _reach(points)
+    if not reach:
+        return squares, weights
+    # The grid spans a reach to either side of the median.
+    for rows in _neighbour_runs(part.means, np.median(points, axis=0), 2.0 * reach):
+        near, far = rows[:-_NEIGHBOUR_DISTANCE], rows[_NEIGHBOUR_DISTANCE:]
+        weight = part.opacities[near].astype(np.float64) * part.opacities[far]
+        difference = part.sh0[near].astype(np.float64) - part.sh0[far]
+        difference = np.clip(difference, -_COLOUR_DIFFERENCE_MAX, _COLOUR_DIFFERENCE_MAX)
+        squares += float((np.square(difference).mean(axis=1) * weight).sum())
+        weights += float(weight.sum())
+    return squares, weights
 
 
 def contrast_of(parts: Iterable[tuple[float, float]]) -> float:
-    """Return the contrast of a scene from the `contrast_sums` of parts of it, in their order."""
-    sums = list(parts)
-    # sum rounds otherwise from Python 3.12 on.
-    return _contrast(math.fsum(squares for squares, _ in sums), math.fsum(weights for _, weights in sums))
+    """Return SH_C0 √(Σ w d² / Σ w), of the `contrast_sums` of parts of a scene; `_CONTRAST_DEFAULT` if Σ w is 0."""
+    squares = weights = 0.0
+    for part in parts:  # built-in sum rounds otherwise from Python 3.12 on
+        squares, weights = squares + part[0], weights + part[1]
+    return SH_C0 * float(np.sqrt(squares / weights)) if weights else _CONTRAST_DEFAULT
 
 
 @dataclass(frozen=True)
@@ -313,13 +455,14 @@ def _default_to(option: Any, default: Any) -> Any:
     return default if option is None else option
 
 
-def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> Lattice:
+def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float, statistics: SceneStatistics) -> Lattice:
     """Choose the lattice of the means by the first option that is set, or by the quality.
 
     Args:
         model: the scene.
         options: `position_error`, `position_step`, and `position_bits`, which divide the extent of the scene's core.
         by_quality: step that the quality chooses, scene units; 0 if the scene has no extent.
+        statistics: has the parts, whose steps follow the quality alone.
     """
     if options.position_error is not None:
         return Lattice(options.position_error / HALF_DIAGONAL, _BITS_MAX, error=options.position_error)
@@ -335,8 +478,11 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> La
     reach = float(np.abs(core).max())
     if options.position_bits is not None:
         return Lattice(_clamp_step(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
-    step = _source_step(model.means, by_quality or extent / (1 << _BITS_MAX))
-    return Lattice(_clamp_step(step, reach), _BITS_MAX)
+    by_quality = by_quality or extent / (1 << _BITS_MAX)
+    step = _clamp_step(_source_step(model.means, by_quality), reach)
+    if step != by_quality:  # of a grid that has all means, or the finest
+        return Lattice(step, _BITS_MAX)
+    return Lattice(step, _BITS_MAX, parts=statistics.parts, rest_octaves=statistics.rest_octaves)
 
 
 def _clamp_step(step: float, reach: float) -> float:
@@ -371,48 +517,14 @@ def _sample_rows(count: int) -> NDArray[np.intp]:
     return np.arange(0, count, max(1, count // _STATISTICS_SAMPLE))
 
 
-def _reach(means: F32) -> tuple[F64, float]:
-    """Return a sample [n, 3] of the means [N, 3], N > 0, and the radius around its median that contains `_CORE` of it.
-
-    The radius is in scene units, 0 if all means of the sample are equal.
-    """
-    points = np.take(means, _sample_rows(len(means)), axis=0).astype(np.float64)
+def _reach(points: F64) -> float:
+    """Return the radius around the median of points [n, 3], n > 0, with `_CORE` of them; 0 if all are equal."""
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())
     if top == 0.0:
-        return points, 0.0
+        return 0.0
     relative = np.sqrt(np.square(distance / top).sum(axis=1))  # squares of relative distances do not overflow
-    return points, top * float(np.quantile(relative, _CORE))
-
-
-def _contrast(squares: float, weights: float) -> float:
-    """Return the rms colour difference, SH_C0 √(Σ w d² / Σ w), of these sums; `_CONTRAST_DEFAULT` if Σ w is 0."""
-    return SH_C0 * float(np.sqrt(squares / weights)) if weights else _CONTRAST_DEFAULT
-
-
-def _contrast_sums(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
-    """Return Σ w d² and Σ w over pairs of splats `_NEIGHBOUR_DISTANCE` apart in Morton order.
-
-    d² is the mean over the channels of the squared difference of sh0, w the product of the opacities. Both sums are 0
-    for few splats, or without an extent. In a large scene, the pairs are a sample.
-
-    Args:
-        model: the splats.
-        sample: [n, 3], positions; their median is the middle of the grid of Morton codes.
-        reach: radius around the median, scene units, >= 0.
-    """
-    squares, weights = 0.0, 0.0
-    if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
-        return squares, weights
-    # The grid spans a reach to either side of the median.
-    for rows in _neighbour_runs(model.means, np.median(sample, axis=0), 2.0 * reach):
-        near, far = rows[:-_NEIGHBOUR_DISTANCE], rows[_NEIGHBOUR_DISTANCE:]
-        weight = model.opacities[near].astype(np.float64) * model.opacities[far]
-        difference = model.sh0[near].astype(np.float64) - model.sh0[far]
-        difference = np.clip(difference, -_COLOUR_DIFFERENCE_MAX, _COLOUR_DIFFERENCE_MAX)
-        squares += float((np.square(difference).mean(axis=1) * weight).sum())
-        weights += float(weight.sum())
-    return squares, weights
+    return top * float(np.quantile(relative, _CORE))
 
 
 def _neighbour_runs(means: F32, centre: NDArray[Any], side: float) -> list[NDArray[np.intp]]:

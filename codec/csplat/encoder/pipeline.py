@@ -56,12 +56,16 @@ from csplat.encoder.target import SearchReport
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
+from csplat.portable_math import exp
 from csplat.scene_metadata import COLOUR_SPACES, UNSPECIFIED
 from csplat.types import F32, Progress, null_progress
 
 Integers = NDArray[Any]
 
 _ALONE = Context(threads=1)  # tiles are shared among threads
+_NOTED_TILE_MIN = 48  # splats of a tile whose means may cause a note; fewer are outliers
+_SMALL = 0.1  # fraction of the splats of a tile that count as small
+_NOTED_ERROR = 2.0  # displacement relative to the size of small splats; presets have at most 1.1 in ordinary scenes
 _FEW_TILES, _SMALL_TILE = 16, 256  # more tiles than this, with fewer splats per tile on average, cause a note
 _COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH4 + 1))
 _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
@@ -170,7 +174,8 @@ class EncodedTile:
         tile: index record and payloads.
         rows: [n], rows of the model in decoding order.
         errors: errors of the splats.
-        coarsened: attributes with such large values that the tile's lattice is coarser.
+        coarsened: attributes with such large values that the tile's lattice is coarser; and means that move by more
+            than `_NOTED_ERROR` times the size of the smallest tenth of the splats.
     """
 
     tile: FileTile
@@ -255,7 +260,9 @@ class EncodedTiles:
             stream.write(piece)
             size += len(piece)
             progress("writing", min(1.0, size / max(1, payloads)))
-        notes = make_notes(self.tiles, bounded=self.plan.parameters.lattice.error is not None)
+        plan = self.plan
+        bounded, measured = plan.parameters.lattice.error is not None, plan.importance is not None
+        notes = make_notes(self.tiles, bounded=bounded, measured=measured)
         errors = declared_errors(self.errors, self.plan.origin)
         return EncodeReport(settings, errors, self.errors.count, len(tiles), size, notes)
 
@@ -303,13 +310,26 @@ def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan) -> list[EncodedTile]:
         return list(pool.map(encode_one, plan.tiles))
 
 
-def make_notes(tiles: Sequence[EncodedTile], *, bounded: bool) -> tuple[str, ...]:
-    """Return warnings about outliers that coarsen their neighbours, and about too small a `position_error`."""
+def make_notes(tiles: Sequence[EncodedTile], *, bounded: bool, measured: bool) -> tuple[str, ...]:
+    """Return warnings about outliers that coarsen their neighbours, small splats that move far, and many tiles.
+
+    Args:
+        tiles: the tiles of level 0.
+        bounded: the caller specified a `position_error`.
+        measured: steps follow the importance of splats, so that those that move far are hardly seen.
+    """
     notes = []
     splats = sum(part.tile.splat_count for part in tiles)
     if bounded and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
         notes.append(f"means: such a small error takes {counted(len(tiles), 'tile')}, and each tile costs bytes")
-    counts = Counter(name for part in tiles for name in part.coarsened)
+    moved = [part for part in tiles if "means" in part.coarsened]
+    if moved and not bounded and not measured:
+        most = max(part.errors.largest["means"] for part in moved)
+        notes.append(
+            f"means: errors of up to {most:.3g} are twice as large as the small splats in {len(moved)} of"
+            f" {counted(len(tiles), 'tile')}, which blurs close views: bound the error of means"
+        )
+    counts = Counter(name for part in tiles for name in part.coarsened - {"means"})
     notes += [
         f"{name}: huge values coarsen {count} of {counted(len(tiles), 'tile')}; remove them, or see the declared errors"
         for name, count in sorted(counts.items())
@@ -342,6 +362,8 @@ def encode_tile(
     result.add_opacities(splats.opacities)
     max_scale = result.add_shapes(splats.quats, splats.scales, part)
     result.add_means(take_precise_means(model, rows), quantised, math.ldexp(parameters.lattice.step, tile.exponent))
+    if len(rows) >= _NOTED_TILE_MIN and result.largest["means"] > _NOTED_ERROR * _small_size(splats.scales):
+        result.coarsened.add("means")
     result.add_sh0(splats.sh0)
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: result.blocks}
     used: tuple[int, ...] = () if part is None else (SHAPE_CODEBOOK_ID,)
@@ -368,6 +390,13 @@ def encode_tile(
     return EncodedTile(
         file_tile, rows, ErrorSums(len(rows), result.largest, result.squares), frozenset(result.coarsened)
     )
+
+
+def _small_size(scales: F32) -> float:
+    """Return the `_SMALL` quantile of the largest standard deviations of splats, of their log scales [n, 3]."""
+    largest = scales.max(axis=1)
+    rank = int(len(largest) * _SMALL)
+    return float(exp(float(np.partition(largest, rank)[rank])))
 
 
 @dataclass

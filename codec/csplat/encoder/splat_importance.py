@@ -329,6 +329,8 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
         alpha = np.maximum(model.opacities.astype(np.float64), 0.25 / squared_levels)
         errors[:, 0] = blocks.opacities * alpha * (4.0 / squared_levels)  # alpha = q² / M²
         errors[:, 3] = blocks.means.astype(np.float64) * steps[2]
+        if parameters.lattice.parts:
+            errors[:, 3] *= 4.0 ** parameters.lattice.octaves_of(model.means)
         errors[:, 4] = blocks.colours * (rgb * steps[3])
         for start in range(0, len(model), _SHAPE_BLOCK):
             part = slice(start, start + _SHAPE_BLOCK)

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors
+from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors, part_of
 from csplat.encoder.entropy import morton_codes
 from csplat.encoder.error_bounds import distance_errors, take_precise_means, with_margin
 from csplat.encoder.quantisation import largest_exact, lattice_values, opacity_levels, opacity_values, quantise_means
@@ -68,7 +68,7 @@ def cut_scene(
     classes: QuantisationClasses | None = None,
     buckets: Sequence[Rows] | None = None,
 ) -> list[TileSplats]:
-    """Partition a scene into tiles: by bucket, by class, by outliers, and by space.
+    """Partition a scene into tiles: by bucket, by class, by outliers, by part, and by space.
 
     An outlier is a value that does not fit the file's lattice and would coarsen the lattice of up to 65,535 other
     splats in its tile. Splats with outliers in the same attributes share tiles, after the other tiles of their class or
@@ -212,12 +212,25 @@ def _cut_groups(
     for group in (0,) if groups is None else np.unique(groups):
         chosen = rows if groups is None else rows[groups == group]
         shared = factors[int(group) % len(factors)]
-        lattice = replace(parameters.lattice, step=math.ldexp(parameters.lattice.step, shared.means))
-        tiles += (
-            TileSplats(chosen[tile.rows], tile.exponent + shared.means, shared)
-            for tile in _cut_within(model, chosen, lattice, parameters.tile_splats)
-        )
+        for part, octaves in _split_parts(model, chosen, parameters.lattice):
+            exponent = shared.means + octaves
+            lattice = replace(parameters.lattice, step=math.ldexp(parameters.lattice.step, exponent))
+            tiles += (
+                TileSplats(part[tile.rows], tile.exponent + exponent, shared)
+                for tile in _cut_within(model, part, lattice, parameters.tile_splats)
+            )
     return tiles
+
+
+def _split_parts(model: SplatModel, rows: Rows, lattice: Lattice) -> Iterator[tuple[Rows, int]]:
+    """Yield the rows of each part of the scene, and of the rest, with the octaves of their step; see `Lattice`."""
+    if not lattice.parts:
+        yield rows, 0
+        return
+    index = part_of(np.take(model.means, rows, axis=0), lattice.parts)
+    for number in np.unique(index):
+        octaves = lattice.parts[number].octaves if number < len(lattice.parts) else lattice.rest_octaves
+        yield rows[index == number], octaves
 
 
 def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
