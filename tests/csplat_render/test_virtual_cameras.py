@@ -37,6 +37,17 @@ def test_cameras_scale_with_the_scene():
         assert np.allclose(128.0 * a.viewmat[:3, 3], b.viewmat[:3, 3], rtol=1e-4, atol=1e-2)
 
 
+def test_parts_far_from_each_other_are_viewed_each_for_itself():
+    near, far = ball(seed=1), ball(400, seed=2)
+    centre = np.array([500.0, 0.0, 0.0])
+    means = np.concatenate([near.means, far.means + centre])
+    cameras = virtual_cameras(cloud(means), 5)
+    assert same(cameras[::2], virtual_cameras(near, 3))
+    assert [True, True] == [np.linalg.norm(camera.position - centre) < 5.0 for camera in cameras[1::2]]
+    under_a_dome = cloud(np.concatenate([near.means, 60.0 * far.means]))
+    assert same(virtual_cameras(near, 2), virtual_cameras(under_a_dome, 4)[1::2])
+
+
 def tower():
     return cloud(np.random.default_rng(0).random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
 

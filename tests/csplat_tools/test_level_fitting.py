@@ -40,7 +40,7 @@ def test_fitted_levels_look_better_than_merged_ones(sample):
 def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(sample):
     # Behind a wall of opaque splats, no camera sees the others.
     rng = np.random.default_rng(0)
-    sides, within = rng.normal(size=(300, 3)), rng.uniform(-0.05, 0.05, (100, 3))
+    sides, within = rng.normal(size=(300, 3)), rng.uniform(-0.3, 0.3, (100, 3))
     sides = (sides / np.linalg.norm(sides, axis=1, keepdims=True)).astype(np.float32)
     wall = replace(sample.select(np.arange(300)), means=sides, scales=np.full((300, 3), -0.8, np.float32))
     hidden = replace(sample.select(np.arange(100)), means=within.astype(np.float32))

@@ -85,9 +85,9 @@ def render_exact(
     with np.errstate(all="ignore"):
         order, drawn, ignored = _project(splats, camera, degree, antialiased, decisions)
         rgb, transmittance, depth = _blend(drawn, camera, transmittance_min, decisions)
+        radii = np.zeros(len(splats.means), np.float32)
+        radii[order] = 3.0 * np.sqrt(np.linalg.eigvalsh(drawn["covariance"])[:, 1])
     rgb += transmittance[..., None] * np.asarray(background, np.float64)
-    radii = np.zeros(len(splats.means), np.float32)
-    radii[order] = 3.0 * np.sqrt(np.linalg.eigvalsh(drawn["covariance"])[:, 1])
     return RenderResult(rgb, 1.0 - transmittance, depth, radii, len(order), 0, ignored)
 
 

@@ -7,17 +7,22 @@ An *object* is viewed from all sides at low to high elevations, close enough to 
 A PSNR depends on distances: the same error gives 33, 39 and 48 dB at distances of one, two and four extents. So they
 are fixed multiples of the scene's extent: `OBJECT_DISTANCES`, `SURROUNDING_DISTANCES`. Cameras depend on nothing but
 the source and the seed, which determines directions.
+
+The cameras of a scene of several parts far from each other are around each part in turn: from outside of all, a part
+would cover a few pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.scene_parts import find_parts, part_min, split_parts
 from csplat.types import F64
 from csplat_render.camera import Camera, intrinsics, orbit
 from csplat_render.scene_frame import (
@@ -58,6 +63,9 @@ _EMPTY_DISTANCE = 2.2  # extents; from the centre of an empty scene
 _GOOD_DETAIL = 0.65  # minimum detail, as a fraction of the best view's
 _AZIMUTH_STEP = 15.0  # degrees
 _POINTS = 60_000  # cloud points
+_PART_SAMPLE = 1 << 16  # splats on which parts are found
+
+T = TypeVar("T")
 
 _CameraAt = Callable[..., Camera]  # `SceneFrame.camera_at` without intrinsics
 
@@ -89,18 +97,47 @@ def virtual_cameras(
     """
     if count < 1:
         raise InputError(f"{count} virtual cameras, expected at least 1")
+    around = partial(_cameras_around, size=(width, height), seed=seed, every=every)
+    return deal(viewed_parts(model), count, around)
+
+
+def _cameras_around(model: SplatModel, count: int, size: tuple[int, int], seed: int, every: int) -> list[Camera]:
+    """Return `count` cameras around a scene or a part of it, as in `virtual_cameras`; `size` is width and height."""
     rng = np.random.default_rng(seed)
     frame = scene_frame(model)
     begin = 360.0 * float(rng.random())
     if len(model) == 0:
-        K = intrinsics(width, height, FIELD_OF_VIEW)
-        return orbit(frame.centre, _EMPTY_DISTANCE, frame.up, count, K, width, height, near=frame.near)
+        K = intrinsics(*size, FIELD_OF_VIEW)
+        return orbit(frame.centre, _EMPTY_DISTANCE, frame.up, count, K, *size, near=frame.near)
     cloud = sample_cloud(model, _POINTS, rng, every)
-    K = intrinsics(width, height, FIELD_OF_VIEW)
-    camera_at = partial(frame.camera_at, K=K, width=width, height=height)
+    K = intrinsics(*size, FIELD_OF_VIEW)
+    camera_at = partial(frame.camera_at, K=K, width=size[0], height=size[1])
     if frame.kind == "object":
         return _around_object(frame, camera_at, cloud, count, begin, rng)
     return _in_surroundings(frame, camera_at, cloud, count, begin)
+
+
+def viewed_parts(model: SplatModel) -> list[SplatModel]:
+    """Return what of a scene is viewed each for itself, the largest first: its parts, or the scene if it has none.
+
+    In place of a rest that surrounds a part, such as a sky, it is the whole scene.
+    """
+    points = model.means[:: max(1, len(model) // _PART_SAMPLE)].astype(np.float64)
+    parts = find_parts(points)
+    *models, rest = split_parts(model, parts)
+    if parts and len(rest) >= part_min(len(points)) * (len(model) / len(points)):
+        middle = np.median(rest.means, axis=0)
+        reach = float(np.median(np.linalg.norm(rest.means - middle, axis=1)))
+        surrounds = any(float(np.linalg.norm(middle - part.centre)) <= reach for part in parts)
+        models.append(model if surrounds else rest)
+    return sorted(models, key=len, reverse=True) or [model]
+
+
+def deal(parts: Sequence[SplatModel], count: int, place: Callable[[SplatModel, int], Sequence[T]]) -> list[T]:
+    """Place `count` cameras, the first around the first part, and so on in turn; `place` places a number of them."""
+    shares = [(count + len(parts) - 1 - number) // len(parts) for number in range(len(parts))]
+    placed = [place(part, share) if share else [] for part, share in zip(parts, shares, strict=True)]
+    return [cameras[turn] for turn in range(shares[0]) for cameras in placed if turn < len(cameras)]
 
 
 def _around_object(

@@ -7,6 +7,7 @@ Copied tiles are not decoded; only their codebook ids are replaced by the ids in
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,6 +56,9 @@ _SHARED_FIELDS = (
     ("units", "unit_metres"), ("antialiasing", "antialiased"), ("flatness", "flat"), ("colour spaces", "colour_space"),
     ("projections", "projection"), ("antialiasing", "antialiasing"),
 )  # fmt: skip
+
+
+_COARSER_MAX = 2.0  # spacing of float32 means in a merged file, as a multiple of the step of a file
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,8 @@ def merge(
 
     Raises:
         InputError: there are fewer than two files, or they contradict each other in axes, up direction, unit,
-            antialiasing, flatness, colour space or projection.
+            antialiasing, flatness, colour space or projection, or are so far from each other that float32 means
+            would ruin one.
         FormatError, UnsupportedError, LimitError, StoreError, OSError: as in `csplat.open`, and errors of reading.
     """
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
@@ -288,6 +293,7 @@ def _encode_again(
 ) -> MergeResult:
     """Decode the scenes tile by tile and encode them together, in memory if they fit."""
     whole = _merge_scenes(scenes)
+    _refuse_rounding(scenes, whole)
     dropped = {column.name for scene in scenes for column in scene.header.extras} - whole.extra.keys()
     with temporary_folder() as folder:
         path = folder / "merged.csplat"
@@ -326,6 +332,23 @@ def _merge_scenes(scenes: Sequence[SplatFile]) -> Scene:
         },
     )
     return whole
+
+
+def _refuse_rounding(scenes: Sequence[SplatFile], whole: Scene) -> None:
+    """Raise `InputError` if float32 means relative to the common origin are too coarse for the steps of a file."""
+    for scene in scenes:
+        header = scene.header
+        distance = float(np.abs(np.array(header.origin) - whole.origin).max())
+        if not len(scene) or not distance:
+            continue
+        exponents = np.repeat([tile.exponent for tile in header.tiles], [tile.splat_count for tile in header.tiles])
+        step = math.ldexp(header.attribute(_spec.ATTRIBUTE_MEANS).step, int(np.median(exponents)))
+        spacing = float(np.spacing(np.float32(distance)))
+        if spacing > _COARSER_MAX * step:
+            raise InputError(
+                f"{scene.name or 'a file'} has steps of {step:.3g}, and is {distance:.3g} from the middle of all, where"
+                f" float32 means are multiples of {spacing:.3g}: scenes so far from each other stay files of their own"
+            )
 
 
 def _merged_blocks(scenes: Sequence[SplatFile], empty: SplatModel) -> Iterator[SplatModel]:

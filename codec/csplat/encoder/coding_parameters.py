@@ -10,7 +10,7 @@ proportion to the splat's size on the screen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from csplat.encoder.encode_options import PRESETS, QUANTISED_PRESETS, EncodeOpti
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
 from csplat.model import SplatModel
 from csplat.portable_math import ceil_log2, exp, log
+from csplat.scene_parts import ScenePart, find_parts, part_min, part_of, split_parts
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -42,13 +43,6 @@ _RUNS = 16  # runs of neighbours in the sample
 _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
 _COLOUR_DIFFERENCE_MAX = 10.0  # sh0; a larger difference is an outlier, and counts as this
 _CORE = 0.8  # fraction of the splats within the reach of a scene or part
-_PART_SAMPLE = 1 << 11  # splats on which parts are found
-_PART_CENTRES = 64  # splats of the sample that may be the centre of a part
-_PART_MIN = 20  # splats of the sample; smaller parts are outliers
-_PART_SHARE = 0.01  # fraction of the sample, for a large sample
-_PARTS_MAX = 32
-_GAP = 3.0  # outer by inner radius of the empty space around a part; that of ten scenes in one piece is at most 2.9
-_GAP_SHARE = 0.01  # fraction of the sample that this space may contain
 _STEP_SHARE_MIN = 2.0**-40  # smallest step of the means, as a fraction of the reach of the scene's core
 _LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its exponential stays within float32
 _CONTRAST_DEFAULT = 0.2  # contrast of a scene without pairs of neighbours
@@ -56,21 +50,6 @@ _LEVELS_RANGE = (8, 255)  # opacity and rotation levels that the quality may cho
 _SCALE_STEP_MAX = 0.5  # log scale; largest step that the quality may choose
 _CODE_BITS = 16  # bits per axis of a Morton code
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
-
-
-@dataclass(frozen=True)
-class ScenePart:
-    """Splats that are far from all others, in comparison with their distances from each other.
-
-    Attributes:
-        centre: x, y, z, scene units.
-        square: squared radius of a sphere that contains them.
-        octaves: <= 0, the steps of their means are the file's times 2**octaves.
-    """
-
-    centre: tuple[float, float, float]
-    square: float
-    octaves: int = 0
 
 
 @dataclass(frozen=True)
@@ -83,8 +62,8 @@ class Lattice:
         finest: tiles use all their bits instead of stopping at `step`; set if the caller specified bits.
         error: largest displacement of a mean, scene units, which tiles are split and made finer to keep, regardless of
             their number; `None`: as the step gives it.
-        parts: parts of the scene with steps of their own; a splat is in the first part whose sphere contains it.
-        rest_octaves: `octaves` of the splats that are in no part.
+        parts: parts of the scene with steps of their own.
+        octaves: <= 0, the step of each part, and of the rest, is the file's times 2**octaves.
     """
 
     step: float
@@ -92,12 +71,7 @@ class Lattice:
     finest: bool = False
     error: float | None = None
     parts: tuple[ScenePart, ...] = ()
-    rest_octaves: int = 0
-
-    def octaves_of(self, means: F32) -> NDArray[np.int8]:
-        """Return log2 of the step of each splat relative to the file's, before its tile is known; means are [N, 3]."""
-        octaves = np.array([*(part.octaves for part in self.parts), self.rest_octaves], np.int8)
-        return octaves[part_of(means, self.parts)]
+    octaves: tuple[int, ...] = (0,)
 
 
 @dataclass(frozen=True)
@@ -262,14 +236,14 @@ class SceneStatistics:
         contrast: rms colour difference of neighbouring splats, weighted by their opacities, in [0.02, 1].
         size: median of the largest standard deviation of the splats of the largest part, or of the rest if that is
             larger, as a fraction of their reach, in [1e-4, 1].
-        parts, rest_octaves: see `Lattice`.
+        parts, octaves: see `Lattice`.
     """
 
     reach: float
     contrast: float
     size: float
     parts: tuple[ScenePart, ...] = ()
-    rest_octaves: int = 0
+    octaves: tuple[int, ...] = (0,)
 
 
 def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
@@ -285,91 +259,20 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     points = np.take(model.means, rows, axis=0).astype(np.float64)
     parts = find_parts(points)
     index = part_of(points, parts)
-    reaches, counts = [], np.bincount(index, minlength=len(parts) + 1)
-    for number in range(len(parts) + 1):
-        reaches.append(_reach(points[index == number]) if counts[number] else 0.0)
+    counts = np.bincount(index, minlength=len(parts) + 1)
+    reaches = [_reach(points[index == number]) if counts[number] else 0.0 for number in range(len(parts) + 1)]
     main = int(np.argmax(counts))
     largest = np.take(model.scales, rows[index == main], axis=0).max(axis=1)
     size = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
     size = size / reaches[main] if reaches[main] else 1.0
     if contrast is None:
-        contrast = contrast_of(contrast_sums(part) for part in _split(model, parts))
-    if counts[-1] < _part_min(len(points)):  # outliers
+        contrast = contrast_of(map(contrast_sums, split_parts(replace(model, shN=model.shN[:, :0], extra={}), parts)))
+    if parts and counts[-1] < part_min(len(points)):  # outliers
         reaches[-1] = 0.0
     reach = max(reaches)
-    octaves = [-max(0, ceil_log2(reach / own * math.sqrt(0.5))) if own else 0 for own in reaches]
-    return SceneStatistics(
-        reach,
-        float(np.clip(contrast, 0.02, 1.0)),
-        float(np.clip(size, 1e-4, 1.0)),
-        tuple(replace(part, octaves=own) for part, own in zip(parts, octaves[:-1], strict=True)),
-        octaves[-1],
-    )
-
-
-def find_parts(points: F64) -> tuple[ScenePart, ...]:
-    """Find the parts of a scene between which there is much more space than within them.
-
-    The centre of a part is the splat, of a few, with the nearest neighbours. Around a part, the shell from its radius
-    to `_GAP` times that radius has hardly any splats.
-
-    Args:
-        points: [n, 3], means of a sample of the scene.
-
-    Returns:
-        The parts, of `octaves` 0; none if the scene is in one piece but for outliers.
-    """
-    rest = points[:: max(1, len(points) // _PART_SAMPLE)]
-    least = _part_min(len(rest))
-    parts: list[ScenePart] = []
-    while len(rest) >= 2 * least and len(parts) < _PARTS_MAX:
-        centres = rest[:: max(1, len(rest) // _PART_CENTRES)]
-        squares = np.stack([np.sort(_squares(rest, centre)) for centre in centres])
-        chosen = int(np.argmin(squares[:, least - 1]))
-        inner, slack = squares[chosen], max(1, int(len(rest) * _GAP_SHARE))
-        inner, outer = inner[least - 1 : -slack], inner[least - 1 + slack :]
-        ratios = np.divide(outer, inner, out=np.zeros_like(outer), where=inner > 0.0)
-        widest = int(np.argmax(ratios))
-        if ratios[widest] < _GAP**2:
-            break
-        x, y, z = map(float, centres[chosen])
-        parts.append(ScenePart((x, y, z), float(inner[widest]) * _GAP))
-        rest = rest[_squares(rest, centres[chosen]) > parts[-1].square]
-    return tuple(parts) if len(parts) > 1 or len(rest) >= least else ()
-
-
-def _part_min(count: int) -> int:
-    """Return the minimum number of splats of a part in a sample of `count` splats."""
-    return max(_PART_MIN, int(count * _PART_SHARE))
-
-
-def part_of(means: NDArray[Any], parts: Sequence[ScenePart]) -> NDArray[np.uint8]:
-    """Return the first part of `parts` that contains each of the means, [N, 3]; the number of parts if none does."""
-    index = np.full(len(means), len(parts), np.uint8)
-    for number in reversed(range(len(parts))):
-        centre = np.array(parts[number].centre)
-        for start in range(0, len(means), _STATISTICS_SAMPLE):
-            block = means[start : start + _STATISTICS_SAMPLE].astype(np.float64)
-            index[start : start + _STATISTICS_SAMPLE][_squares(block, centre) <= parts[number].square] = number
-    return index
-
-
-def _split(model: SplatModel, parts: Sequence[ScenePart]) -> Iterator[SplatModel]:
-    """Yield the splats of each part, and of the rest, without SH bands from 1 on."""
-    if not parts:
-        yield model
-        return
-    index = part_of(model.means, parts)
-    plain = replace(model, shN=model.shN[:, :0], extra={})
-    for number in range(len(parts) + 1):
-        yield plain.select(np.flatnonzero(index == number))
-
-
-def _squares(points: F64, centre: F64) -> F64:
-    """Return the squared distances of points, [n, 3], from a centre, [3]."""
-    x, y, z = (points - centre).T
-    squares: F64 = x * x + y * y + z * z
-    return squares
+    octaves = tuple(-max(0, ceil_log2(reach / own * math.sqrt(0.5))) if own else 0 for own in reaches)
+    size, contrast = float(np.clip(size, 1e-4, 1.0)), float(np.clip(contrast, 0.02, 1.0))
+    return SceneStatistics(reach, contrast, size, parts, octaves)
 
 
 def contrast_sums(part: SplatModel) -> tuple[float, float]:
@@ -482,7 +385,7 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float, stati
     step = _clamp_step(_source_step(model.means, by_quality), reach)
     if step != by_quality:  # of a grid that has all means, or the finest
         return Lattice(step, _BITS_MAX)
-    return Lattice(step, _BITS_MAX, parts=statistics.parts, rest_octaves=statistics.rest_octaves)
+    return Lattice(step, _BITS_MAX, parts=statistics.parts, octaves=statistics.octaves)
 
 
 def _clamp_step(step: float, reach: float) -> float:

@@ -20,6 +20,7 @@ from csplat.encoder.error_bounds import rotation_rows
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.portable_math import exp
+from csplat.scene_parts import part_of
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -330,7 +331,8 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
         errors[:, 0] = blocks.opacities * alpha * (4.0 / squared_levels)  # alpha = q² / M²
         errors[:, 3] = blocks.means.astype(np.float64) * steps[2]
         if parameters.lattice.parts:
-            errors[:, 3] *= 4.0 ** parameters.lattice.octaves_of(model.means)
+            octaves = np.array(parameters.lattice.octaves)[part_of(model.means, parameters.lattice.parts)]
+            errors[:, 3] *= 4.0**octaves
         errors[:, 4] = blocks.colours * (rgb * steps[3])
         for start in range(0, len(model), _SHAPE_BLOCK):
             part = slice(start, start + _SHAPE_BLOCK)

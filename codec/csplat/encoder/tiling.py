@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors, part_of
+from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors
 from csplat.encoder.entropy import morton_codes
 from csplat.encoder.error_bounds import distance_errors, take_precise_means, with_margin
 from csplat.encoder.quantisation import largest_exact, lattice_values, opacity_levels, opacity_values, quantise_means
@@ -19,6 +19,7 @@ from csplat.encoder.quantisation_classes import QuantisationClasses
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.portable_math import ceil_log2
+from csplat.scene_parts import part_of
 from csplat.types import F32, I64, U8, Mask
 
 Rows = NDArray[np.intp]
@@ -229,8 +230,7 @@ def _split_parts(model: SplatModel, rows: Rows, lattice: Lattice) -> Iterator[tu
         return
     index = part_of(np.take(model.means, rows, axis=0), lattice.parts)
     for number in np.unique(index):
-        octaves = lattice.parts[number].octaves if number < len(lattice.parts) else lattice.rest_octaves
-        yield rows[index == number], octaves
+        yield rows[index == number], lattice.octaves[number]
 
 
 def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: int) -> list[TileSplats]:

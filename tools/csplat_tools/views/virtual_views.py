@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from csplat.types import F64
 from csplat_render import Camera
 from csplat_render.camera import direction_at, intrinsics, look_at, relative_to
 from csplat_render.scene_frame import SceneFrame, detail, sample_cloud, scene_frame
-from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, is_clear, virtual_cameras
+from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, deal, is_clear, viewed_parts, virtual_cameras
 
 T = TypeVar("T")
 
@@ -98,8 +99,14 @@ def camera_sequence(
     Returns:
         `count` cameras, by a low-discrepancy sequence over directions, distances and targets. There are more
         candidates than needed: last come, and are dropped, cameras around an object whose view is hidden from nearby,
-        and cameras in a surrounding scene that show little detail.
+        and cameras in a surrounding scene that show little detail. Cameras of a scene of several parts are around each
+        in turn.
     """
+    return deal(viewed_parts(model), count, partial(_cameras_around, size=size, seed=seed, reach=reach))
+
+
+def _cameras_around(model: SplatModel, count: int, size: tuple[int, int], seed: int, reach: float) -> list[Camera]:
+    """Return `count` cameras around a scene or a part of it, as in `camera_sequence`."""
     frame = scene_frame(model)
     K = intrinsics(*size, FIELD_OF_VIEW)
     points = _sequence(_CANDIDATES * count, seed)
@@ -226,18 +233,24 @@ def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
     Returns:
         12 cameras of each kind, by its name in reports.
     """
-    frame = scene_frame(source)
-    others = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
-    groups = {"beside": others, "farther": [at_distance(camera, frame.centre, _FARTHER) for camera in others]}
-    if not len(source):
-        return {**groups, "nearer": others}
-    cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
+    groups = zip(*deal(viewed_parts(source), VIRTUAL_SIZES.extra[0], _extra_cameras), strict=True)
+    return dict(zip(("beside", "farther", "nearer"), map(list, groups), strict=True))
+
+
+def _extra_cameras(part: SplatModel, count: int) -> list[tuple[Camera, Camera, Camera]]:
+    """Return `count` cameras at other positions around a part of a scene, each with one farther and one nearer."""
+    frame = scene_frame(part)
+    others = virtual_cameras(part, count, *VIRTUAL_SIZES.extra[1:], seed=_SEED)
+    farther = [at_distance(camera, frame.centre, _FARTHER) for camera in others]
+    if not len(part):
+        return list(zip(others, farther, others, strict=True))
+    cloud = sample_cloud(part, _POINTS, np.random.default_rng(_SEED))
     candidates = [[at_distance(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in others]
     nearer = [
         next((camera for camera in distances if is_clear(frame, cloud, camera)), distances[-1])
         for distances in candidates
     ]
-    return {**groups, "nearer": nearer}
+    return list(zip(others, farther, nearer, strict=True))
 
 
 def at_distance(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
