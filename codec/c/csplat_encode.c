@@ -988,7 +988,6 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
     while (count >= 2 * least && found < PARTS_MAX) {
         uint32_t step = count / PART_CENTRES ? count / PART_CENTRES : 1, slack = (uint32_t)((double)count * 0.01);
         double widest = 0.0, *centre = parts[found].centre;
-        slack = slack ? slack : 1;
         for (uint32_t k = 0; k < count; k += step) {
             for (uint32_t i = 0; i < count; i++)
                 squares[i] = square_distance(points + 3 * (size_t)i, points + 3 * (size_t)k);
@@ -998,8 +997,9 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
                 memcpy(centre, points + 3 * (size_t)k, 3 * sizeof *centre);
             }
         }
-        for (uint32_t i = least - 1; i + slack < count; i++) {
-            double ratio = best[i] > 0.0 ? best[i + slack] / best[i] : 0.0;
+        for (uint32_t i = least - 1; i < count; i++) {
+            uint32_t within = slack < (i + 1) / 10 ? slack : (i + 1) / 10, beyond = i + (within ? within : 1);
+            double ratio = beyond < count && best[i] > 0.0 ? best[beyond] / best[i] : 0.0;
             if (ratio > widest) {
                 widest = ratio;
                 parts[found].square = best[i] * 3.0;
@@ -1039,55 +1039,46 @@ static uint32_t rows_of_part(const encoder *e, const view *v, const statistics *
 static int measure_scene(encoder *e, const view *v, double contrast, statistics *s)
 {
     view sample = thin_out(v, STATISTICS_SAMPLE);
-    double centre[3], reaches[PARTS_MAX + 1], total[2] = {0.0, 0.0}, *sizes, size = 0.0;
-    uint32_t *rows, main = 0, count = 0;
+    double centre[3], reaches[PARTS_MAX + 1], sums[2], found = 0.0, *sizes;
+    uint32_t *rows;
     TRY(find_parts(e, &sample, s->parts, &s->part_count));
     TRY(rows = get(e, v->count, sizeof *rows));
-    s->reach = 0.0;
+    s->reach = s->size = 0.0;
     for (unsigned k = 0; k <= s->part_count; k++) {
         view part = {rows, rows_of_part(e, &sample, s, k, rows), 1};
+        double size;
         reaches[k] = 0.0;
-        if (!part.count)
-            continue;
+        if (!part.count || (s->part_count && k == s->part_count && part.count < part_least(sample.count)))
+            continue; /* outliers */
         TRY(find_reach(e, &part, centre, &reaches[k]));
-        if (part.count > main) {
-            main = part.count;
-            TRY(sizes = get(e, main, sizeof *sizes));
-            for (uint32_t i = 0; i < main; i++) {
-                const float *scales = e->scales + 3 * (size_t)rows[i];
-                sizes[i] = larger(larger(scales[0], scales[1]), scales[2]);
-            }
-            TRY(sort_doubles(e, sizes, main));
-            size = main % 2 ? sizes[main / 2] : ((float)sizes[(main - 1) / 2] + (float)sizes[main / 2]) / 2.0f;
-            drop(e, sizes);
-            size = csplat_exp(clip(size, -80.0, 80.0));
-            size = reaches[k] > 0.0 ? size / reaches[k] : 1.0;
-        }
-        count = part.count;
-    }
-    if (s->part_count && count < part_least(sample.count)) /* outliers */
-        reaches[s->part_count] = 0.0;
-    for (unsigned k = 0; k <= s->part_count; k++)
         s->reach = larger(s->reach, reaches[k]);
+        TRY(sizes = get(e, part.count, sizeof *sizes));
+        for (uint32_t i = 0; i < part.count; i++) {
+            const float *scales = e->scales + 3 * (size_t)rows[i];
+            sizes[i] = larger(larger(scales[0], scales[1]), scales[2]);
+        }
+        TRY(sort_doubles(e, sizes, part.count));
+        size = part.count % 2 ? sizes[part.count / 2]
+                              : ((float)sizes[(part.count - 1) / 2] + (float)sizes[part.count / 2]) / 2.0f;
+        drop(e, sizes);
+        size = csplat_exp(clip(size, -80.0, 80.0));
+        s->size = larger(s->size, reaches[k] > 0.0 ? size / reaches[k] : 1.0);
+        if (contrast >= 0.0)
+            continue;
+        part.count = rows_of_part(e, v, s, k, rows);
+        TRY(find_reach(e, &part, centre, &size));
+        TRY(sum_contrast(e, &part, centre, size, &sums[0], &sums[1]));
+        found = larger(found, contrast_of(sums[0], sums[1]));
+    }
     for (unsigned k = 0; k <= s->part_count; k++) {
         double ratio = reaches[k] > 0.0 ? s->reach / reaches[k] * sqrt(0.5) : 1.0;
         int octaves = ceil_log2(ratio);
         s->parts[k].octaves = octaves > 0 ? -octaves : 0;
     }
-    for (unsigned k = 0; contrast < 0.0 && k <= s->part_count; k++) {
-        view part = {rows, rows_of_part(e, v, s, k, rows), 1};
-        double reach, sums[2];
-        if (!part.count)
-            continue;
-        TRY(find_reach(e, &part, centre, &reach));
-        TRY(sum_contrast(e, &part, centre, reach, &sums[0], &sums[1]));
-        total[0] += sums[0];
-        total[1] += sums[1];
-    }
-    contrast = contrast < 0.0 ? contrast_of(total[0], total[1]) : contrast;
+    contrast = contrast < 0.0 ? found : contrast;
     drop(e, rows);
     s->contrast = clip(contrast, 0.02, 1.0);
-    s->size = clip(size, 1e-4, 1.0);
+    s->size = clip(s->size, 1e-4, 1.0);
     return 1;
 }
 

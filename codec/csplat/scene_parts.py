@@ -23,7 +23,8 @@ _LEAST = 20  # splats of the sample; fewer are outliers
 _LEAST_SHARE = 0.01  # the same as a fraction of a large sample
 _PARTS_MAX = 32
 _GAP = 3.0  # outer by inner radius of the empty shell around a part; in twenty scenes of one piece it is at most 2.9
-_GAP_SHARE = 0.01  # fraction of the sample that the shell may contain
+_GAP_SHARE = 0.01  # fraction of the sample that the shell may contain,
+_GAP_PART_SHARE = 10  # and at most one splat for every ten of the part, so that it does not cut off the part's border
 _BLOCK = 1 << 16  # splats per block of temporaries
 
 
@@ -60,8 +61,10 @@ def find_parts(points: F64) -> tuple[ScenePart, ...]:
         centres = rest[:: max(1, len(rest) // _CENTRES)]
         squares = np.stack([np.sort(_squares(rest, centre)) for centre in centres])
         chosen = int(np.argmin(squares[:, least - 1]))
-        slack = max(1, int(len(rest) * _GAP_SHARE))
-        inner, outer = squares[chosen][least - 1 : -slack], squares[chosen][least - 1 + slack :]
+        last = np.arange(least - 1, len(rest))  # the last splat of the part
+        beyond = last + np.maximum(1, np.minimum(int(len(rest) * _GAP_SHARE), (last + 1) // _GAP_PART_SHARE))
+        last = last[beyond < len(rest)]
+        inner, outer = squares[chosen][last], squares[chosen][beyond[: len(last)]]
         ratios = np.divide(outer, inner, out=np.zeros_like(outer), where=inner > 0.0)
         widest = int(np.argmax(ratios))
         if ratios[widest] < _GAP**2:

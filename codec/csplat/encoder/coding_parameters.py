@@ -227,15 +227,12 @@ def band_slice(band: int) -> slice:
 
 @dataclass(frozen=True)
 class SceneStatistics:
-    """Statistics of a scene.
-
-    The reach of splats is the radius around the median of their means that contains 80 % of them, scene units, >= 0.
+    """Statistics of a scene, the largest of any part or the rest.
 
     Attributes:
-        reach: the largest reach of a part or of the rest, or that of the scene if it is in one piece.
+        reach: radius around the median of the means that contains 80 % of them, scene units, >= 0.
         contrast: rms colour difference of neighbouring splats, weighted by their opacities, in [0.02, 1].
-        size: median of the largest standard deviation of the splats of the largest part, or of the rest if that is
-            larger, as a fraction of their reach, in [1e-4, 1].
+        size: median of the largest standard deviation, as a fraction of the reach, in [1e-4, 1].
         parts, octaves: see `Lattice`.
     """
 
@@ -260,15 +257,19 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     parts = find_parts(points)
     index = part_of(points, parts)
     counts = np.bincount(index, minlength=len(parts) + 1)
-    reaches = [_reach(points[index == number]) if counts[number] else 0.0 for number in range(len(parts) + 1)]
-    main = int(np.argmax(counts))
-    largest = np.take(model.scales, rows[index == main], axis=0).max(axis=1)
-    size = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
-    size = size / reaches[main] if reaches[main] else 1.0
+    if parts and counts[-1] < part_min(len(points)):
+        counts[-1] = 0  # outliers
+    groups = [number for number, count in enumerate(counts) if count]
+    reaches, size = [0.0] * len(counts), 0.0
+    for number in groups:
+        reaches[number] = _reach(points[index == number])
+        largest = np.take(model.scales, rows[index == number], axis=0).max(axis=1)
+        median = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
+        size = max(size, median / reaches[number] if reaches[number] else 1.0)
     if contrast is None:
-        contrast = contrast_of(map(contrast_sums, split_parts(replace(model, shN=model.shN[:, :0], extra={}), parts)))
-    if parts and counts[-1] < part_min(len(points)):  # outliers
-        reaches[-1] = 0.0
+        plain = replace(model, shN=model.shN[:, :0], extra={})
+        sums = [contrast_sums(part) for part in split_parts(plain, parts)]
+        contrast = max(contrast_of([sums[number]]) for number in groups)
     reach = max(reaches)
     octaves = tuple(-max(0, ceil_log2(reach / own * math.sqrt(0.5))) if own else 0 for own in reaches)
     size, contrast = float(np.clip(size, 1e-4, 1.0)), float(np.clip(contrast, 0.02, 1.0))
