@@ -1000,12 +1000,14 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
         for (uint32_t i = least - 1; i < count; i++) {
             uint32_t within = slack < (i + 1) / 10 ? slack : (i + 1) / 10, beyond = i + (within ? within : 1);
             double ratio = beyond < count && best[i] > 0.0 ? best[beyond] / best[i] : 0.0;
-            if (ratio > widest) {
+            if (widest > 0.0 && ratio < 9.0)
+                break; /* beyond the next shell may be other parts */
+            if (ratio >= 9.0 && ratio > widest) {
                 widest = ratio;
                 parts[found].square = best[i] * 3.0;
             }
         }
-        if (widest < 9.0)
+        if (!(widest > 0.0))
             break;
         kept = 0;
         for (uint32_t i = 0; i < count; i++)
@@ -1071,7 +1073,7 @@ static int measure_scene(encoder *e, const view *v, double contrast, statistics 
         found = larger(found, contrast_of(sums[0], sums[1]));
     }
     for (unsigned k = 0; k <= s->part_count; k++) {
-        double ratio = reaches[k] > 0.0 ? s->reach / reaches[k] * sqrt(0.5) : 1.0;
+        double ratio = reaches[k] > 0.0 ? s->reach / reaches[k] : 1.0;
         int octaves = ceil_log2(ratio);
         s->parts[k].octaves = octaves > 0 ? -octaves : 0;
     }

@@ -66,9 +66,11 @@ def find_parts(points: F64) -> tuple[ScenePart, ...]:
         last = last[beyond < len(rest)]
         inner, outer = squares[chosen][last], squares[chosen][beyond[: len(last)]]
         ratios = np.divide(outer, inner, out=np.zeros_like(outer), where=inner > 0.0)
-        widest = int(np.argmax(ratios))
-        if ratios[widest] < _GAP**2:
+        empty = np.append(ratios >= _GAP**2, False)
+        first = int(np.argmax(empty))  # beyond the next shell may be other parts
+        if not empty[first]:
             break
+        widest = first + int(np.argmax(ratios[first : first + int(np.argmin(empty[first:]))]))
         x, y, z = map(float, centres[chosen])
         parts.append(ScenePart((x, y, z), float(inner[widest]) * _GAP))
         rest = rest[_squares(rest, centres[chosen]) > parts[-1].square]

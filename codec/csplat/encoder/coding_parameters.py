@@ -271,7 +271,7 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
         sums = [contrast_sums(part) for part in split_parts(plain, parts)]
         contrast = max(contrast_of([sums[number]]) for number in groups)
     reach = max(reaches)
-    octaves = tuple(-max(0, ceil_log2(reach / own * math.sqrt(0.5))) if own else 0 for own in reaches)
+    octaves = tuple(-max(0, ceil_log2(reach / own)) if own else 0 for own in reaches)
     size, contrast = float(np.clip(size, 1e-4, 1.0)), float(np.clip(contrast, 0.02, 1.0))
     return SceneStatistics(reach, contrast, size, parts, octaves)
 
