@@ -972,22 +972,44 @@ static uint32_t part_least(uint32_t count)
     return share > PART_MIN ? share : PART_MIN;
 }
 
+static double largest_scale(const encoder *e, uint32_t row)
+{
+    const float *scales = e->scales + 3 * (size_t)row;
+    return larger(larger(scales[0], scales[1]), scales[2]);
+}
+
+/* Return the median of largest standard deviations, of their logarithms, which are sorted. */
+static int median_size(encoder *e, double *sizes, uint32_t count, double *size)
+{
+    double median;
+    TRY(sort_doubles(e, sizes, count));
+    median = count % 2 ? sizes[count / 2] : ((float)sizes[(count - 1) / 2] + (float)sizes[count / 2]) / 2.0f;
+    *size = csplat_exp(clip(median, -80.0, 80.0));
+    return 1;
+}
+
 /* Find the parts of a scene between which there is much more space than within them (coding_parameters.find_parts). */
 static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigned *part_count)
 {
     view few = thin_out(sample, PART_SAMPLE);
     uint32_t count = few.count, least = part_least(count), kept;
-    double *points, *squares, *best;
+    double *points, *squares, *best, *sizes;
+    uint32_t *rows;
     unsigned found = 0;
     TRY(points = get(e, 3 * (uint64_t)count, sizeof *points));
     TRY(squares = get(e, count, sizeof *squares));
     TRY(best = get(e, count, sizeof *best));
-    for (uint32_t i = 0; i < count; i++)
+    TRY(sizes = get(e, count, sizeof *sizes));
+    TRY(rows = get(e, count, sizeof *rows));
+    for (uint32_t i = 0; i < count; i++) {
+        rows[i] = row_of(&few, i);
         for (uint32_t axis = 0; axis < 3; axis++)
-            points[3 * (size_t)i + axis] = e->in->means[3 * (size_t)row_of(&few, i) + axis];
+            points[3 * (size_t)i + axis] = e->in->means[3 * (size_t)rows[i] + axis];
+    }
     while (count >= 2 * least && found < PARTS_MAX) {
         uint32_t step = count / PART_CENTRES ? count / PART_CENTRES : 1, slack = (uint32_t)((double)count * 0.01);
-        double widest = 0.0, *centre = parts[found].centre;
+        double widest = 0.0, *centre = parts[found].centre, size;
+        uint32_t near = 0;
         for (uint32_t k = 0; k < count; k += step) {
             for (uint32_t i = 0; i < count; i++)
                 squares[i] = square_distance(points + 3 * (size_t)i, points + 3 * (size_t)k);
@@ -997,14 +1019,20 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
                 memcpy(centre, points + 3 * (size_t)k, 3 * sizeof *centre);
             }
         }
+        for (uint32_t i = 0; i < count; i++)
+            if (square_distance(points + 3 * (size_t)i, centre) <= best[least - 1])
+                sizes[near++] = largest_scale(e, rows[i]);
+        TRY(median_size(e, sizes, near, &size));
+        size *= size;
         for (uint32_t i = least - 1; i < count; i++) {
+            double inner = larger(best[i], size);
             uint32_t within = slack < (i + 1) / 10 ? slack : (i + 1) / 10, beyond = i + (within ? within : 1);
-            double ratio = beyond < count && best[i] > 0.0 ? best[beyond] / best[i] : 0.0;
+            double ratio = beyond < count && inner > 0.0 ? best[beyond] / inner : 0.0;
             if (widest > 0.0 && ratio < 9.0)
                 break; /* beyond the next shell may be other parts */
             if (ratio >= 9.0 && ratio > widest) {
                 widest = ratio;
-                parts[found].square = best[i] * 3.0;
+                parts[found].square = inner * 3.0;
             }
         }
         if (!(widest > 0.0))
@@ -1013,12 +1041,15 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
         for (uint32_t i = 0; i < count; i++)
             if (square_distance(points + 3 * (size_t)i, centre) > parts[found].square) {
                 memmove(points + 3 * (size_t)kept, points + 3 * (size_t)i, 3 * sizeof *points);
+                rows[kept] = rows[i];
                 kept++;
             }
         count = kept;
         found++;
     }
     *part_count = found > 1 || count >= least ? found : 0;
+    drop(e, rows);
+    drop(e, sizes);
     drop(e, best);
     drop(e, squares);
     drop(e, points);
@@ -1053,17 +1084,13 @@ static int measure_scene(encoder *e, const view *v, double contrast, statistics 
         if (!part.count || (s->part_count && k == s->part_count && part.count < part_least(sample.count)))
             continue; /* outliers */
         TRY(find_reach(e, &part, centre, &reaches[k]));
-        s->reach = larger(s->reach, reaches[k]);
         TRY(sizes = get(e, part.count, sizeof *sizes));
-        for (uint32_t i = 0; i < part.count; i++) {
-            const float *scales = e->scales + 3 * (size_t)rows[i];
-            sizes[i] = larger(larger(scales[0], scales[1]), scales[2]);
-        }
-        TRY(sort_doubles(e, sizes, part.count));
-        size = part.count % 2 ? sizes[part.count / 2]
-                              : ((float)sizes[(part.count - 1) / 2] + (float)sizes[part.count / 2]) / 2.0f;
+        for (uint32_t i = 0; i < part.count; i++)
+            sizes[i] = largest_scale(e, rows[i]);
+        TRY(median_size(e, sizes, part.count, &size));
         drop(e, sizes);
-        size = csplat_exp(clip(size, -80.0, 80.0));
+        reaches[k] = s->part_count ? larger(reaches[k], size) : reaches[k];
+        s->reach = larger(s->reach, reaches[k]);
         s->size = larger(s->size, reaches[k] > 0.0 ? size / reaches[k] : 1.0);
         if (contrast >= 0.0)
             continue;

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat.types import F64
+from csplat.portable_math import exp
+from csplat.types import F32, F64
 
 _SAMPLE = 1 << 11  # splats on which parts are found
 _CENTRES = 64  # splats of the sample that may be the centre of a part
@@ -25,6 +26,7 @@ _PARTS_MAX = 32
 _GAP = 3.0  # outer by inner radius of the empty shell around a part; in twenty scenes of one piece it is at most 2.9
 _GAP_SHARE = 0.01  # fraction of the sample that the shell may contain,
 _GAP_PART_SHARE = 10  # and at most one splat for every ten of the part, so that it does not cut off the part's border
+_LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its square stays within float64
 _BLOCK = 1 << 16  # splats per block of temporaries
 
 
@@ -41,30 +43,34 @@ class ScenePart:
     square: float
 
 
-def find_parts(points: F64) -> tuple[ScenePart, ...]:
+def find_parts(points: F64, scales: F32) -> tuple[ScenePart, ...]:
     """Find the parts of a scene between which there is much more space than within them.
 
     The centre of a part is the splat, of a few, with the nearest neighbours. The shell around the part, from its radius
-    to `_GAP` times that radius, has hardly any splats.
+    to `_GAP` times that radius, has hardly any splats. A part is at least as large as its splats.
 
     Args:
         points: [n, 3], means of a sample of the scene.
+        scales: [n, 3], their log scales.
 
     Returns:
         The parts; none if the scene is in one piece but for outliers. Splats in no part are the rest, which may be
         another part, or surround the others.
     """
-    rest = points[:: max(1, len(points) // _SAMPLE)]
+    step = max(1, len(points) // _SAMPLE)
+    rest, largest = points[::step], scales[::step].max(axis=1)
     least = part_min(len(rest))
     parts: list[ScenePart] = []
     while len(rest) >= 2 * least and len(parts) < _PARTS_MAX:
         centres = rest[:: max(1, len(rest) // _CENTRES)]
         squares = np.stack([np.sort(_squares(rest, centre)) for centre in centres])
         chosen = int(np.argmin(squares[:, least - 1]))
+        apart = _squares(rest, centres[chosen])
+        size = median_size(largest[apart <= squares[chosen, least - 1]])
         last = np.arange(least - 1, len(rest))  # the last splat of the part
         beyond = last + np.maximum(1, np.minimum(int(len(rest) * _GAP_SHARE), (last + 1) // _GAP_PART_SHARE))
         last = last[beyond < len(rest)]
-        inner, outer = squares[chosen][last], squares[chosen][beyond[: len(last)]]
+        inner, outer = np.maximum(squares[chosen][last], size * size), squares[chosen][beyond[: len(last)]]
         ratios = np.divide(outer, inner, out=np.zeros_like(outer), where=inner > 0.0)
         empty = np.append(ratios >= _GAP**2, False)
         first = int(np.argmax(empty))  # beyond the next shell may be other parts
@@ -73,8 +79,14 @@ def find_parts(points: F64) -> tuple[ScenePart, ...]:
         widest = first + int(np.argmax(ratios[first : first + int(np.argmin(empty[first:]))]))
         x, y, z = map(float, centres[chosen])
         parts.append(ScenePart((x, y, z), float(inner[widest]) * _GAP))
-        rest = rest[_squares(rest, centres[chosen]) > parts[-1].square]
+        outside = apart > parts[-1].square
+        rest, largest = rest[outside], largest[outside]
     return tuple(parts) if len(parts) > 1 or len(rest) >= least else ()
+
+
+def median_size(largest: F32) -> float:
+    """Return the median of largest standard deviations, scene units, of their logarithms [n], n > 0."""
+    return float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
 
 
 def part_min(count: int) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -42,9 +43,10 @@ PIECES = {  # how many parts have at least a tenth of the splats, the rest inclu
     "a density that falls": (1, cluster(3000) * 10.0 ** RNG.uniform(-1, 1, (3000, 1))),
     "two far ones": (2, together(cluster(), cluster(centre=(8, 0, 0)))),
     "two very far ones": (2, together(cluster(), cluster(centre=(1e7, 0, 0)))),
-    "one small and dense": (2, together(cluster(2000), cluster(250, 0.01, (0, 30, 0)))),
+    "one small and dense": (2, together(cluster(2000), cluster(250, 0.1, (0, 30, 0)))),
     "a dome of large radius": (2, together(cluster(600), dome(300, 500))),
     "a dome of most splats": (2, together(cluster(300), dome(600, 20))),
+    "less apart than a splat is large": (1, together(1e-30 * cluster(300), cluster(300, 0.05))),
     "a few between them": (2, together(cluster(), cluster(centre=(50, 0, 0)), RNG.uniform(0, 50, (20, 3)))),
     "five in a row": (5, together(*(cluster(300, centre=(20 * i, 0, 0)) for i in range(5)))),
 }
@@ -53,7 +55,8 @@ PIECES = {  # how many parts have at least a tenth of the splats, the rest inclu
 def test_parts_are_what_has_much_more_space_around_it_than_within():
     found = {}
     for name, (_, points) in PIECES.items():
-        index = part_of(points.astype(np.float32), find_parts(points))
+        parts = find_parts(points, np.full((len(points), 3), math.log(0.02), np.float32))
+        index = part_of(points.astype(np.float32), parts)
         found[name] = int((np.bincount(index) >= len(points) / 10).sum())
     assert {name: count for name, (count, _) in PIECES.items()} == found
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_parts import find_parts, part_min, split_parts
+from csplat.scene_parts import find_parts, median_size, part_min, split_parts
 from csplat.types import F64
 from csplat_render.camera import Camera, intrinsics, orbit
 from csplat_render.scene_frame import (
@@ -120,17 +120,26 @@ def _cameras_around(model: SplatModel, count: int, size: tuple[int, int], seed: 
 def viewed_parts(model: SplatModel) -> list[SplatModel]:
     """Return what of a scene is viewed each for itself, the largest first: its parts, or the scene if it has none.
 
-    In place of a rest that surrounds a part, such as a sky, it is the whole scene.
+    In place of a rest that surrounds a part, such as a sky, it is the whole scene. Splats at one place, which look like
+    one splat, are not viewed.
     """
-    points = model.means[:: max(1, len(model) // _PART_SAMPLE)].astype(np.float64)
-    parts = find_parts(points)
+    step = max(1, len(model) // _PART_SAMPLE)
+    points = model.means[::step].astype(np.float64)
+    parts = find_parts(points, model.scales[::step])
     *models, rest = split_parts(model, parts)
     if parts and len(rest) >= part_min(len(points)) * (len(model) / len(points)):
         middle = np.median(rest.means, axis=0)
         reach = float(np.median(np.linalg.norm(rest.means - middle, axis=1)))
         surrounds = any(float(np.linalg.norm(middle - part.centre)) <= reach for part in parts)
         models.append(model if surrounds else rest)
+    models = [part for part in models if part is model or _is_spread(part)]
     return sorted(models, key=len, reverse=True) or [model]
+
+
+def _is_spread(part: SplatModel) -> bool:
+    """Return True if half the splats of a part are farther from its middle than they are large."""
+    distances = np.linalg.norm(part.means - np.median(part.means, axis=0), axis=1)
+    return float(np.median(distances)) > median_size(part.scales.max(axis=1))
 
 
 def deal(parts: Sequence[SplatModel], count: int, place: Callable[[SplatModel, int], Sequence[T]]) -> list[T]:

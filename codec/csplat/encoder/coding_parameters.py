@@ -22,7 +22,7 @@ from csplat.encoder.encode_options import PRESETS, QUANTISED_PRESETS, EncodeOpti
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
 from csplat.model import SplatModel
 from csplat.portable_math import ceil_log2, exp, log
-from csplat.scene_parts import ScenePart, find_parts, part_min, part_of, split_parts
+from csplat.scene_parts import ScenePart, find_parts, median_size, part_min, part_of, split_parts
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -44,7 +44,6 @@ _NEIGHBOUR_DISTANCE = 8  # positions in Morton order
 _COLOUR_DIFFERENCE_MAX = 10.0  # sh0; a larger difference is an outlier, and counts as this
 _CORE = 0.8  # fraction of the splats within the reach of a scene or part
 _STEP_SHARE_MIN = 2.0**-40  # smallest step of the means, as a fraction of the reach of the scene's core
-_LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its exponential stays within float32
 _CONTRAST_DEFAULT = 0.2  # contrast of a scene without pairs of neighbours
 _LEVELS_RANGE = (8, 255)  # opacity and rotation levels that the quality may choose
 _SCALE_STEP_MAX = 0.5  # log scale; largest step that the quality may choose
@@ -254,7 +253,8 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
         return SceneStatistics(reach=0.0, contrast=_CONTRAST_DEFAULT, size=0.01)
     rows = _sample_rows(len(model))
     points = np.take(model.means, rows, axis=0).astype(np.float64)
-    parts = find_parts(points)
+    scales = np.take(model.scales, rows, axis=0)
+    parts = find_parts(points, scales)
     index = part_of(points, parts)
     counts = np.bincount(index, minlength=len(parts) + 1)
     if parts and counts[-1] < part_min(len(points)):
@@ -263,8 +263,9 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     reaches, size = [0.0] * len(counts), 0.0
     for number in groups:
         reaches[number] = _reach(points[index == number])
-        largest = np.take(model.scales, rows[index == number], axis=0).max(axis=1)
-        median = float(exp(float(np.clip(np.median(largest), -_LOG_SIZE_MAX, _LOG_SIZE_MAX))))
+        median = median_size(scales[index == number].max(axis=1))
+        if parts:
+            reaches[number] = max(reaches[number], median)
         size = max(size, median / reaches[number] if reaches[number] else 1.0)
     if contrast is None:
         plain = replace(model, shN=model.shN[:, :0], extra={})
