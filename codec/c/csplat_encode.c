@@ -175,6 +175,7 @@
 #define SPEC_SEMANTIC_LABEL "label"
 #define SPEC_SEMANTIC_OBJECT_ID "object_id"
 #define SPEC_SEMANTIC_NORMAL "normal"
+#define SPEC_SEMANTIC_MOTION "motion"
 #define SPEC_SEMANTIC_INTENSITY "intensity"
 #define SPEC_SEMANTIC_TIME "time"
 #define SPEC_SEMANTIC_FRAME "frame"

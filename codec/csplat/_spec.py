@@ -221,11 +221,12 @@ META_KEY_NAMES: Final[dict[str, str]] = {"title": "title", "licence": "licence",
 SEMANTIC_LABEL: Final = "label"
 SEMANTIC_OBJECT_ID: Final = "object_id"
 SEMANTIC_NORMAL: Final = "normal"
+SEMANTIC_MOTION: Final = "motion"
 SEMANTIC_INTENSITY: Final = "intensity"
 SEMANTIC_TIME: Final = "time"
 SEMANTIC_FRAME: Final = "frame"
 SEMANTIC_FEATURE: Final = "feature:"
-SEMANTIC_NAMES: Final[dict[str, str]] = {"label": "label", "object_id": "object_id", "normal": "normal", "intensity": "intensity", "time": "time", "frame": "frame", "feature:": "feature"}
+SEMANTIC_NAMES: Final[dict[str, str]] = {"label": "label", "object_id": "object_id", "normal": "normal", "motion": "motion", "intensity": "intensity", "time": "time", "frame": "frame", "feature:": "feature"}
 
 # Error codes
 ERROR_MAGIC: Final = "E_MAGIC"

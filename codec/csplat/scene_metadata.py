@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from csplat import _spec
 from csplat.errors import InputError
 
@@ -37,6 +39,16 @@ TRAINED, ESTIMATE, AUTHOR = "training", "estimate", "author"
 #: Cosine of the angle between up directions that contradict each other; at larger angles another axis is closer to up.
 CONTRADICTS = math.cos(math.radians(45.0))
 
+#: Kinds of dtypes and number of components that a semantic requires; of `motion`, a multiple of this number.
+_SEMANTIC_TYPES = {
+    _spec.SEMANTIC_LABEL: ("iu", 1),
+    _spec.SEMANTIC_OBJECT_ID: ("iu", 1),
+    _spec.SEMANTIC_FRAME: ("iu", 1),
+    _spec.SEMANTIC_NORMAL: ("f", 3),
+    _spec.SEMANTIC_MOTION: ("f", 3),
+    _spec.SEMANTIC_TIME: ("f", 1),
+    _spec.SEMANTIC_INTENSITY: ("iuf", 1),
+}
 _AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
 _DIGITS = 6  # decimals; hides differences in the last bits between machines
 _UNIT = 1e-5  # tolerance for the length of a unit vector of six digits
@@ -63,7 +75,7 @@ class SceneMetadata:
             `from`: `training`, `estimate` or `author`), `estimated` (list of the keys whose values are estimates).
             Properties return their values if these are valid.
         semantics: what extra columns mean, by the column's name: `label`, `object_id`, `normal`, `feature:` and the
-            name of a model, and so on (registry of semantics, spec 12).
+            name of a model, and so on (registry of semantics, spec 12). `semantic_of` returns one if its type suits.
         quantised: the values come from a file of one byte each (SPZ, SOG), so that many of them are equal. It says how
             to encode a scene, is not written to files, and does not count in comparisons.
 
@@ -129,6 +141,22 @@ class SceneMetadata:
         """Comments of the scene's source."""
         comments = self.entries.get(COMMENTS)
         return [comment for comment in comments if isinstance(comment, str)] if isinstance(comments, list) else []
+
+    def semantic_of(self, column: str, dtype: np.dtype[Any]) -> str:
+        """Return what an extra column means: its semantic, else its name if that is one; "" if unknown.
+
+        Args:
+            column: name of the column.
+            dtype: type of its values, with a shape for several values of a splat. A semantic that requires another
+                type is unknown.
+        """
+        semantic = self.semantics.get(column) or (column if column in _SEMANTIC_TYPES else "")
+        if semantic not in _SEMANTIC_TYPES:
+            return semantic
+        kinds, components = _SEMANTIC_TYPES[semantic]
+        count = math.prod(dtype.shape)
+        fits = count % components == 0 if semantic == _spec.SEMANTIC_MOTION else count == components
+        return semantic if fits and dtype.base.kind in kinds else ""
 
     def with_entries(self, **entries: Any) -> SceneMetadata:
         """Return the metadata with some entries added or replaced; `None` removes an entry."""

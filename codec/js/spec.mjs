@@ -213,11 +213,12 @@ export const META_KEY_NAMES = Object.freeze({ 'title': 'title', 'licence': 'lice
 export const SEMANTIC_LABEL = 'label';
 export const SEMANTIC_OBJECT_ID = 'object_id';
 export const SEMANTIC_NORMAL = 'normal';
+export const SEMANTIC_MOTION = 'motion';
 export const SEMANTIC_INTENSITY = 'intensity';
 export const SEMANTIC_TIME = 'time';
 export const SEMANTIC_FRAME = 'frame';
 export const SEMANTIC_FEATURE = 'feature:';
-export const SEMANTIC_NAMES = Object.freeze({ 'label': 'label', 'object_id': 'object_id', 'normal': 'normal', 'intensity': 'intensity', 'time': 'time', 'frame': 'frame', 'feature:': 'feature' });
+export const SEMANTIC_NAMES = Object.freeze({ 'label': 'label', 'object_id': 'object_id', 'normal': 'normal', 'motion': 'motion', 'intensity': 'intensity', 'time': 'time', 'frame': 'frame', 'feature:': 'feature' });
 
 // Error codes
 export const ERROR_MAGIC = 'E_MAGIC';

@@ -3,6 +3,8 @@
 
 The mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ is the same for M and -M, and either M or -M is a
 rotation. Colours change by the parity of their SH bands. So axes can be converted to axes of either handedness.
+
+Extra columns change with the scene if they mean normals or displacements (`SceneMetadata.semantic_of`).
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat import _spec
 from csplat.errors import InputError
-from csplat.model import SplatModel, normalise_quats, sh_degree_of
+from csplat.model import SplatModel, normalise_quats, sh_degree_of, splat_dtype
 from csplat.scene import Scene
 from csplat.scene_metadata import UNSPECIFIED, VIEW, Direction, SceneMetadata, check_axes, unit_up, up_of_axes
 from csplat.spherical_harmonics import evaluate_sh
@@ -78,7 +81,7 @@ def convert_axes(scene: Scene, axes: str) -> Scene:
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
-    """Rotate a scene about its zero: means, rotations, colours, origin, up direction and cameras.
+    """Rotate a scene about its zero: means, rotations, colours, normals, displacements, origin, up direction, cameras.
 
     If the matrix only permutes and flips axes, the result is exact for means, rotations and scales, and for SH if z
     stays on its line: rotating back restores the arrays bit for bit.
@@ -94,7 +97,7 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
         InputError: the matrix is not orthogonal.
     """
     matrix = np.asarray(rotation, np.float64)
-    if matrix.shape != (3, 3) or not (np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all():
+    if matrix.shape != (3, 3) or not _is_orthogonal(matrix):
         raise InputError(f"the rotation is {matrix.tolist()}, expected an orthogonal matrix [3, 3]")
     quats, scales = _rotate_shapes(model, matrix)
     x, y, z = (_multiply_rows(matrix, np.array(model.origin)) + 0.0).tolist()  # no negative zeros
@@ -108,11 +111,12 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
         origin=(x, y, z),
         means_double=doubles,
         metadata=rotate_metadata(model.metadata, matrix),
+        extra=_map_extra(model, matrix, matrix),
     )
 
 
 def scale_scene(model: SplatModel, factor: float) -> SplatModel:
-    """Multiply all lengths of a scene by a factor.
+    """Multiply all lengths of a scene by a factor, displacements included.
 
     Raises:
         InputError: the factor is not above 0, or a value exceeds float32.
@@ -133,13 +137,15 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
             origin=(x, y, z),
             means_double=doubles,
             metadata=replace(metadata, unit_metres=None if unit is None else unit / factor),
+            extra=_map_extra(model, np.eye(3) * factor, np.eye(3)),
         )
 
 
 def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
     """Apply a linear map to a scene.
 
-    Colours follow the rotation in the polar decomposition of the map. Cameras are dropped unless it scales uniformly.
+    Colours follow the rotation in the polar decomposition of the map, and normals stay perpendicular to their surfaces.
+    Cameras are dropped unless it scales uniformly.
 
     Args:
         model: the scene, or some of its splats.
@@ -168,6 +174,7 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
             origin=(x, y, z),
             means_double=doubles,
             metadata=replace(model.metadata.with_entries(view=None), cameras=None),
+            extra=_map_extra(model, stretch, np.linalg.inv(stretch).T),
         )
 
 
@@ -179,6 +186,41 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     metadata = _with_cameras(model.metadata, lambda camera: _translate_camera(camera, step))
     with np.errstate(over="ignore"):  # infinity is refused
         return replace(model, means=means.astype(np.float32), means_double=doubles, metadata=metadata)
+
+
+def _map_extra(model: SplatModel, linear: F64, of_normals: F64) -> dict[str, NDArray[Any]]:
+    """Return the extra columns of a model under a linear map; exact if it permutes and flips axes.
+
+    Args:
+        model: the model.
+        linear: [3, 3], which maps displacements as it maps differences of means.
+        of_normals: [3, 3], its inverse transpose or a multiple, which keeps normals perpendicular to their surfaces;
+            they keep their lengths.
+
+    Raises:
+        InputError: a finite value exceeds the type of its column.
+    """
+    extra = dict(model.extra)
+    for name, column in model.extra.items():
+        semantic = model.metadata.semantic_of(name, splat_dtype(column))
+        if semantic not in (_spec.SEMANTIC_NORMAL, _spec.SEMANTIC_MOTION):
+            continue
+        rows = column.reshape(-1, 3).astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            mapped = _multiply_rows(of_normals if semantic == _spec.SEMANTIC_NORMAL else linear, rows)
+            if semantic == _spec.SEMANTIC_NORMAL and not _is_orthogonal(of_normals):
+                before, after = (np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in (rows, mapped))
+                mapped *= np.divide(before, after, out=np.ones_like(before), where=after > 0.0)
+            mapped = mapped.astype(column.dtype)
+        if not np.isfinite(mapped[np.isfinite(rows).all(axis=1)]).all():
+            raise InputError(f"extra column {name!r} exceeds {column.dtype} after the change of the scene")
+        extra[name] = mapped.reshape(column.shape)
+    return extra
+
+
+def _is_orthogonal(matrix: F64) -> bool:
+    """Return True if M Mᵀ is the identity, up to rounding."""
+    return bool((np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all())
 
 
 def rotation_to_axes(metadata: SceneMetadata, axes: str) -> F64:

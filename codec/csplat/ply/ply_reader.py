@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import plyfile
 
-from csplat import _spec
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import local_file
 from csplat.errors import InputError, counted
@@ -63,15 +62,6 @@ _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
 _PACKED_COLOURS = ("colors", "color", "rgb")
 _FORMATS = {"=": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}  # by plyfile's byte order
-#: Semantics by which a column may be named: kinds of dtypes and number of components.
-_SEMANTIC_TYPES = {
-    _spec.SEMANTIC_LABEL: ("iu", 1),
-    _spec.SEMANTIC_OBJECT_ID: ("iu", 1),
-    _spec.SEMANTIC_FRAME: ("iu", 1),
-    _spec.SEMANTIC_NORMAL: ("f", 3),
-    _spec.SEMANTIC_TIME: ("f", 1),
-    _spec.SEMANTIC_INTENSITY: ("iuf", 1),
-}
 _SHOWN = 40  # maximum number of characters of a word in a message
 _SHOWN_NAMES = 200  # characters of names in a message, which may be a MiB long
 _DAMAGED = (plyfile.PlyParseError, ValueError, OverflowError, MemoryError)  # what plyfile and NumPy raise
@@ -301,15 +291,10 @@ def _open(
     columns = with_colour_range(_row_blocks(path, rows), columns, findings)
     comments = parse_comments(content.comments)
     findings += comments.findings
-    semantics = {name: name for name, group in columns.extra.items() if _has_meaning(name, rows.dtype[group[0]], group)}
+    types = {name: np.dtype((rows.dtype[group[0]], len(group))) for name, group in columns.extra.items()}
+    semantics = {name: name for name, dtype in types.items() if name == comments.metadata.semantic_of(name, dtype)}
     metadata = replace(comments.metadata, semantics=semantics | dict(comments.metadata.semantics))
     return _OpenPly(path, rows, columns, replace(comments, metadata=metadata))
-
-
-def _has_meaning(name: str, dtype: np.dtype[Any], group: Sequence[str]) -> bool:
-    """Return True if the name of an extra column is a semantic that its type and number of components suit."""
-    kinds, components = _SEMANTIC_TYPES.get(name, ("", 0))
-    return dtype.kind in kinds and len(group) == components
 
 
 def _load(

@@ -193,6 +193,65 @@ def test_changing_axes_and_back_is_exact(make_model, degree):
         assert np.abs(model.quats - rotate_scene(rotate_scene(model, matrix), matrix.T).quats).max() < 1e-6
 
 
+def with_directions(make_model, rng, count=20):
+    """Return a model with random normals and displacements by name and by semantic, and columns that do not turn."""
+    extra = {
+        "normal": rng.standard_normal((count, 3)).astype("f4"),
+        "facing": rng.standard_normal((count, 3)),
+        "motion": rng.standard_normal((count, 3 * int(rng.integers(1, 4)))).astype("f4"),
+        "flow": rng.standard_normal((count, 3)).astype("f4"),
+        "other": rng.standard_normal((count, 3)).astype("f4"),
+        "label": rng.integers(0, 9, count).astype("i4"),
+    }
+    extra["normal"][0] = 0.0  # no normal
+    return make_model(count, 1, extra=extra, semantics={"facing": "normal", "flow": "motion", "other": "feature:x"})
+
+
+def assert_turned(model, changed, linear, atol=1e-5):
+    """Check the columns of `with_directions` against their definitions under a linear map."""
+    inverse = np.linalg.inv(linear)
+    for name, column in model.extra.items():
+        expected = column
+        if name in ("motion", "flow"):
+            expected = (column.reshape(-1, 3) @ linear.T).reshape(column.shape)
+        elif name in ("normal", "facing"):
+            expected = column @ inverse
+            lengths = np.linalg.norm(expected, axis=1, keepdims=True)
+            expected = expected / np.maximum(lengths, 1e-30) * np.linalg.norm(column, axis=1, keepdims=True)
+        assert column.dtype == changed.extra[name].dtype
+        np.testing.assert_allclose(changed.extra[name], expected, rtol=1e-5, atol=atol)
+    assert model.metadata.semantics == changed.metadata.semantics
+
+
+def test_normals_and_displacements_change_with_the_scene(make_model):
+    rng = np.random.default_rng(5)
+    for _ in range(25):
+        model = with_directions(make_model, rng)
+        rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]  # every other one mirrors
+        factor, matrix = float(rng.uniform(0.1, 9)), rng.standard_normal((3, 3)) + 2 * np.eye(3)
+        assert_turned(model, rotate_scene(model, rotation), rotation)
+        assert_turned(model, scale_scene(model, factor), factor * np.eye(3))
+        assert_turned(model, translate_scene(model, (1.0, 2.0, 3.0)), np.eye(3))
+        assert_turned(model, stretch_scene(model, factor * rotation), factor * rotation, 1e-4)
+        assert_turned(model, stretch_scene(model, matrix), matrix, 1e-4)
+    for axes in ("".join(signed) for one in permutations(("RL", "UD", "FB")) for signed in product(*one)):
+        there = convert_axes(Scene.of(replace(model, metadata=replace(model.metadata, coordinate_system="RDF"))), axes)
+        assert_turned(model, there.model(), axes_rotation("RDF", axes))
+        back = convert_axes(there, "RDF").model()
+        for name, column in model.extra.items():
+            assert (column == back.extra[name]).all()  # exact, as for the means
+    far = replace(model, extra={"motion": np.full((20, 3), 3e38, "f4")})
+    with pytest.raises(InputError, match="'motion' exceeds float32"):
+        scale_scene(far, 10.0)
+
+
+def test_columns_whose_type_does_not_suit_their_semantic_stay(make_model):
+    extra = {"normal": np.ones((9, 2), "f4"), "motion": np.ones((9, 4), "f4"), "bent": np.ones((9, 3), "i1")}
+    model = make_model(9, 0, extra=extra, semantics={"bent": "normal"})
+    for changed in (rotate_scene(model, axes_rotation("RDF", "UFR")), scale_scene(model, 2.0)):
+        assert all((changed.extra[name] == column).all() for name, column in extra.items())
+
+
 def test_axis_letters_up_and_cameras_follow_a_rotation(make_model):
     model = make_model(3, 0, coordinate_system="RDF", cameras=[CAMERA], entries={"view": CAMERA, "up": [0, 0, 1]})
     assert "LUF" == rotate_scene(model, axes_rotation("RDF", "LUF")).metadata.coordinate_system

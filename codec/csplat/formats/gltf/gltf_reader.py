@@ -310,7 +310,9 @@ class _GltfReading:
         opened = self.files[view]
         check_primitive(self.file, placed, opened.header, payload_bounds(opened))
         matrix = payload_matrix(opened.header.coordinate_system)
-        plain = SceneMetadata(antialiased=opened.metadata.antialiased, flat=opened.metadata.flat)
+        plain = SceneMetadata(
+            antialiased=opened.metadata.antialiased, flat=opened.metadata.flat, semantics=opened.metadata.semantics
+        )
 
         def turned(model: SplatModel) -> SplatModel:
             return rotate_scene(replace(model, origin=(0.0, 0.0, 0.0), metadata=plain), matrix)
