@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Describe findings about splat files: unusual or invalid content and its repair.
 
-A *note* is ordinary variation; nothing is lost or looks different. A *repair* changes or drops data safely; `strict`
-refuses it. An *error* cannot be repaired without guessing. A *loss* is detected while writing: the target cannot hold
-part of the scene.
+A *note* is ordinary variation; nothing looks different. A *repair* changes or drops data safely; `strict` refuses it.
+An *error* cannot be repaired without guessing. A *loss* is detected while writing: the target cannot hold part of the
+scene. What a reader leaves out is in `lost` of a note or repair; `convert` lists it, and `--no-loss` refuses it.
 
 | id | meaning | kind |
 |---|---|---|
@@ -18,7 +18,7 @@ part of the scene.
 | `malformed` | a row that cannot be parsed, or binary rows changed by a text-mode transfer | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
 | `list-columns` | list properties of splats: dropped | repair |
-| `other-elements` | elements other than the splats: dropped | repair |
+| `other-elements` | contents that are not splats, such as elements of PLY, meshes, extensions: dropped | repair |
 | `nonfinite-rows` | splats with NaN or infinity: dropped; an error if no splats remain | repair |
 | `zero-quats` | rotations of length 0: replaced by the identity | repair |
 | `unnormalised-quats` | rotations that are not of unit length: normalised, as in every renderer | note |
@@ -28,7 +28,8 @@ part of the scene.
 | `packed-colours` | three bytes of colour in a row, of which the header declares one (nerfstudio) | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
 | `extra-columns` | columns that splats do not have: dropped unless extra columns are kept | note |
-| `nonzero-normals` | normals, which splats do not use: dropped | note |
+| `double-columns` | attributes in doubles: rounded to float32 | note |
+| `nonzero-normals` | normals that differ, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
 | `shuffled-columns` | columns in an unusual order | note |
 | `alias-columns` | columns under another program's names: CloudCompare's `scalar_opacity` | note |
@@ -50,7 +51,7 @@ part of the scene.
 | `colour-space`, `projection` | a .csplat file of others than csplat draws: drawn as sRGB, in perspective | note |
 | `other-scenes` | more scenes than the one that is read, in a SOG's zip or in glTF without a default scene | note |
 | `double-means` | positions in doubles or integers: an origin keeps their precision | note |
-| `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
+| `non-ascii-header` | names outside ASCII, or comments outside UTF-8, in the header: read as question marks | note |
 | `zero-rows` | splats of .splat and .ksplat whose bytes are all 0: kept | note |
 | `empty` | no splats at all | note |
 | `log-scales` | scales that should be standard deviations, most of them negative: read as logarithms | repair |
@@ -76,6 +77,8 @@ from typing import Literal
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
+_NAMES_MAX, _NAME_MAX = 6, 40  # names in a list, characters of a name
+
 FindingKind = Literal["note", "repair", "error", "loss"]
 
 
@@ -91,6 +94,7 @@ class Finding:
         usual: True if most trained scenes have the finding; it is shown only if all findings are requested.
         attribute: name of the array concerned; "" if none.
         largest_error: largest difference from the source among the values of the attribute; `None`: unknown.
+        lost: the contents of the file that its reader leaves out, in a few words each.
     """
 
     id: str
@@ -100,6 +104,7 @@ class Finding:
     usual: bool = False
     attribute: str = ""
     largest_error: float | None = None
+    lost: tuple[str, ...] = ()
 
     @property
     def repairable(self) -> bool:
@@ -112,8 +117,21 @@ class Finding:
 
 def trailing_bytes(count: int) -> list[Finding]:
     """Return the finding for bytes after the last splat, if there are any."""
-    text = f"{counted(count, 'byte')} after the last splat: ignored"
-    return [Finding("trailing-bytes", count, text, "repair")] if count > 0 else []
+    what = f"{counted(count, 'byte')} after the last splat"
+    return [Finding("trailing-bytes", count, f"{what}: ignored", "repair", lost=(what,))] if count > 0 else []
+
+
+def list_names(names: Sequence[str]) -> str:
+    """Join names from a file for messages: the first few, shortened, with question marks for control characters."""
+    shown = ["".join(c if c.isprintable() else "?" for c in name[:_NAME_MAX]) for name in names[:_NAMES_MAX]]
+    more = len(names) - len(shown)
+    return ", ".join(shown) + (f" and {more:,} more" if more else "")
+
+
+def other_contents(contents: Sequence[str]) -> list[Finding]:
+    """Return the finding for contents that are not splats, in a few words each, if there are any."""
+    text = f"besides the splats: {', '.join(contents)}: dropped"
+    return [Finding("other-elements", len(contents), text, "repair", lost=tuple(contents))] if contents else []
 
 
 def too_many_bands(degree: int) -> str:

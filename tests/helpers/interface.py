@@ -45,7 +45,7 @@ INTERNAL = {
     "EncodeResult": "content rows with_notes with_search",
     "FinetuneOptions": "has_calmed learning_rate_factor scaled",
     "Scene": "changed empty has_doubles in_memory keep_open like loaded modified_ns numbered of reader with_progress",
-    "SceneMetadata": "stated_up",
+    "SceneMetadata": "semantic_of stated_up",
     "SimplifyOptions": "pruner views_and_size work",
     "SplatModel": "means_double",
     "Target": "as_json count is_rendered require size_bytes",

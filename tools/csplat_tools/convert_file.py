@@ -17,10 +17,10 @@ from csplat.decoder import Limits
 from csplat.disk_files import resolve_links, size_on_disk
 from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.encoder import PresetName
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.formats import format_by_name, format_by_suffix, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
-from csplat.lint import Finding, refuse
+from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.scene_metadata import UNSPECIFIED, UP
@@ -223,7 +223,7 @@ class Conversion:
         floater_count: number of floaters dropped.
         levels: number of splats of each level of detail of the target, finest first.
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
-        lost: contents that the target format does not support.
+        lost: contents that the reader leaves out or the target format does not support.
         rounded: names of the arrays that the target rounds.
         losses: findings about values that the target does not hold: clamped, or moved visibly; a dry run does not find
             the latter.
@@ -346,18 +346,24 @@ def convert_file(
         if writes.name in _WITH_VIEW and not dry_run and not writes.keeps(levels[0]):
             levels = [with_first_view(levels[0], progress=progress)]
         scene, counts = levels[0], tuple(changed.count for changed in levels if changed.count)
+        if no_loss:
+            for _ in reader.blocks():  # which may add findings
+                pass
+        left_out = _left_out(reader, whole=bool(level or max_splats is not None or has_levels))
         lost, keeps = writes.losses(scene), writes.keeps(scene)
-        exact = frozenset(ARRAYS) if keeps else writes.exact
+        exact = frozenset(ARRAYS) if keeps else writes.exact - ({"means"} if scene.has_doubles else set())
         rounded = tuple(name for name in ARRAYS if name not in exact and (name != "shN" or scene.sh_degree))
         result = Conversion(
             reader.format, writes.name, reader.count, scene.count, count - scene.count, scene.sh_degree, counts or (0,),
-            size_on_disk(local), writes.expected_bytes(scene), lost, rounded, (),
+            size_on_disk(local), writes.expected_bytes(scene), (*left_out, *lost), rounded, (),
             (before, writes.axes or scene.metadata.coordinate_system), filter_axes, (),
         )  # fmt: skip
-        if no_loss and (lost or rounded):
-            raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
-        if no_loss:
-            refuse(reader.findings, strict=True)
+        repairs = [finding for finding in reader.findings if finding.kind == "repair"]
+        if no_loss and (result.lost or rounded or repairs):
+            told = {words for finding in repairs for words in finding.lost}
+            rest = replace(result, lost=tuple(words for words in result.lost if words not in told)).lost_words()
+            reasons = [rest] * bool(rest) + [f"{finding.id}: {finding.text}" for finding in repairs]
+            raise InputError(f"{writes.title} does not keep all of {source}: {'; '.join(reasons)}")
         reporting = [
             changed if keeps else with_progress(changed, f"reading level {level + at}" if more else "reading", progress)
             for at, changed in enumerate(levels)
@@ -369,7 +375,15 @@ def convert_file(
             result = replace(result, size_bytes=size_on_disk(path))
         result = replace(result, losses=tuple(finding for finding in losses if finding.id != "lost-contents"))
         findings = tuple(finding for finding in reader.findings if not (more and finding.id == "levels"))
-        return replace(result, findings=findings)
+        left_out = _left_out(reader, whole=bool(level or max_splats is not None or has_levels))  # also by its blocks
+        return replace(result, lost=(*left_out, *lost), findings=findings)
+
+
+def _left_out(scene: Scene, *, whole: bool) -> list[str]:
+    """Return what the reader of a scene leaves out, in a few words each; its coarser levels, too, unless `whole`."""
+    words = [lost for finding in scene.findings for lost in finding.lost]
+    coarser = 0 if whole else len(scene.levels) - 1
+    return [*dict.fromkeys(words), *([f"{counted(coarser, 'coarser level')} of detail"] if coarser > 0 else [])]
 
 
 def decode_file(

@@ -5,6 +5,9 @@
 
 All are pickles of torch. No code in them is run: `weights_only` admits only tensors, containers and plain numbers. Some
 facts, such as antialiased training, are not in the checkpoint, but in other files of the trainer.
+
+Tensors with a row for each splat that are no splat attributes are listed as left out. Networks, cameras, statistics of
+gradients and the state of optimisers are not: they serve the training, and an exported PLY has none of them, either.
 """
 
 from __future__ import annotations
@@ -30,9 +33,17 @@ from csplat.errors import InputError, counted, missing_package
 from csplat.file_source import open_binary
 from csplat.formats import Format
 from csplat.interop import from_gsplat
-from csplat.lint import Finding, too_many_bands
+from csplat.lint import Finding, list_names, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
+from csplat.ply.columns import (
+    AttributeArrays,
+    RowStatistics,
+    choose_thickness,
+    is_rounded,
+    list_findings,
+    rounded_doubles,
+    survey_arrays,
+)
 from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene import Scene, join_blocks
 from csplat.scene_metadata import SceneMetadata
@@ -49,6 +60,8 @@ _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
 #: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
+#: Tensors of INRIA's trainer, and of those derived from it, that decide which splats are cloned and pruned.
+_STATISTICS = re.compile(r"max_radii2D|denom|(xyz|means2D)_gradient_accum.*")
 _FILTER = "filter_3D"  # name of Mip-Splatting's tensor of filter sizes
 #: gsplat's names of tensors, by the names in gsplat and splatfacto, in Gaussian Splatting Lightning, and of attributes
 #: in INRIA's `GaussianModel`, which trainers derived from it save as a state.
@@ -237,7 +250,7 @@ def _read_content(content: object, size: int, sh_degree: int | None) -> _Checkpo
     if not isinstance(content, Mapping):
         raise InputError(f"it holds a {type(content).__name__}, expected a checkpoint of gsplat, splatfacto or INRIA")
     if isinstance(content.get("splats"), Mapping):
-        return _checked_part(content["splats"], size, sh_degree)
+        return _checked_part({**content, **content["splats"]}, size, sh_degree)
     holder = next((content[name] for name in _HOLDERS if isinstance(content.get(name), Mapping)), content)
     named = {str(name): value for name, value in holder.items()}
     models = _find_models(named)
@@ -250,8 +263,13 @@ def _read_content(content: object, size: int, sh_degree: int | None) -> _Checkpo
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
     (prefix,) = models
     tensors = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
-    part = _checked_part({_NAMES.get(name, name): value for name, value in tensors.items()}, size, sh_degree)
-    if part.model.sh_degree or "features_rest" not in tensors:
+    tensors = {_NAMES.get(name, name): value for name, value in tensors.items()}
+    # Other modules next to the splats have tensors of images and networks.
+    known = {**{str(name): value for name, value in content.items()}, **named}
+    outer = {name: value for name, value in known.items() if prefix.startswith(name[: name.rfind(".") + 1])}
+    others = {name: value for name, value in outer.items() if not name.startswith(prefix)}
+    part = _checked_part({**others, **tensors}, size, sh_degree)
+    if part.model.sh_degree or f"{prefix}features_rest" not in named:
         return part
     # Without SH splatfacto trains logits of colours.
     colours = 1.0 / (1.0 + np.exp(-part.model.sh0.astype(np.float64)))
@@ -262,12 +280,17 @@ def _inria_tensors(content: object) -> dict[str, Any] | None:
     """Return the splats of a checkpoint of INRIA's trainer, a pair of `capture`'s result and the iteration.
 
     Returns:
-        Tensors by gsplat's names; `None` for contents of another form.
+        Tensors by gsplat's names, others by their index; `None` for contents of another form.
     """
     captured = content[0] if isinstance(content, tuple) and len(content) == 2 else None
     if not isinstance(captured, tuple) or len(captured) <= len(_INRIA) or not hasattr(captured[1], "numel"):
         return None
-    return dict(zip(_INRIA, captured[1:], strict=False))
+    tensors = dict(zip(_INRIA, captured[1:], strict=False))
+    rest = {at: value for at, value in enumerate(captured) if at > len(_INRIA)}
+    optimiser = next((at for at, value in rest.items() if isinstance(value, Mapping)), 0)
+    radii = [at for at, value in rest.items() if at < optimiser and getattr(value, "ndim", 0) == 1]
+    statistics = range(radii[-1], optimiser) if radii else ()  # from max_radii2D on
+    return tensors | {f"item {at}": value for at, value in rest.items() if at not in statistics}
 
 
 def _find_models(named: Mapping[str, Any]) -> dict[str, Any]:
@@ -298,7 +321,7 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     """Check tensors named as in gsplat, and return their splats; one or two scales per splat are completed to three.
 
     Args:
-        splats: the tensors; values of other names are ignored, `filter_3D` with a finding.
+        splats: the tensors; those of other names with a row for each splat are left out with a finding.
         size: size of the file in bytes; an expanded tensor may claim more values.
         sh_degree: as for `_open_checkpoint`.
 
@@ -318,6 +341,8 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
             splats = {**splats, "shN": shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]}
     findings = []
     splats = {name: _to_array(value) if name in _NAMES.values() else value for name, value in splats.items()}
+    doubles = [name for name in sorted({*_NAMES.values()} - {"means"}) if is_rounded(splats.get(name, np.zeros(0)))]
+    findings += [rounded_doubles(doubles)] if doubles else []
     scales = splats.get("scales")
     if scales is not None and scales.ndim in (1, 2) and scales.size == len(scales):
         splats["scales"] = scales = np.repeat(scales.reshape(-1, 1), 3, axis=1)
@@ -330,12 +355,25 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
         findings.append(Finding("flat-scales", 1, "splats have two scales: they are discs (2DGS)", "note"))
     if _FILTER in splats:
         text = f"{_FILTER} of Mip-Splatting is ignored, not fused: export the scene as PLY, which fuses it"
-        findings.append(Finding("filter-3d", 1, text, "repair"))
+        findings.append(Finding("filter-3d", 1, text, "repair", lost=(_FILTER,)))
     model = replace(from_gsplat(splats), metadata=SceneMetadata(flat=is_flat))
     arrays = AttributeArrays(
         splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
     )
-    return _CheckpointPart(model, arrays, 2 if is_flat else 3, findings)
+    return _CheckpointPart(model, arrays, 2 if is_flat else 3, findings + _other_tensors(splats, len(model)))
+
+
+def _other_tensors(tensors: Mapping[str, Any], count: int) -> list[Finding]:
+    """Return the finding about tensors with a row for each of `count` splats that are not read, if there are any."""
+    shapes = {str(name): tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
+    names = [
+        f"{name} ({' × '.join(map(str, shape))})"
+        for name, shape in shapes.items()
+        if count and shape[:1] == (count,) and name not in {*_NAMES.values(), _FILTER}
+        if not _STATISTICS.fullmatch(name.rpartition(".")[2])
+    ]
+    what = f"tensors {list_names(names)}"
+    return [Finding("extra-columns", len(names), f"{what}: dropped", "note", lost=(what,))] if names else []
 
 
 def _to_array(value: Any) -> Any:

@@ -32,6 +32,7 @@ from csplat.model import MAX_SH_DEGREE, SplatModel, check_model, check_sh_degree
 from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
 from csplat.ply.columns import HUGE_LOG
+from csplat.ply.comments import unwritten_entries
 from csplat.remote_store import is_url, open_store
 from csplat.scene import Scene
 from csplat.splat_file import SplatFile
@@ -422,6 +423,7 @@ _PLY_FORMAT = Format(
     carries=frozenset(
         {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "extra", "metadata"}
     ),
+    unwritten=unwritten_entries,
 )
 _CSPLAT_FORMAT = Format(
     name=_CSPLAT,

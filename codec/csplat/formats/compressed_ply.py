@@ -7,7 +7,7 @@ as in a plain PLY.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,9 +27,9 @@ from csplat.formats.common import (
     sorted_shells,
 )
 from csplat.formats.format import Format, ValueRange
-from csplat.lint import Finding, trailing_bytes
+from csplat.lint import Finding, list_names, other_contents, trailing_bytes
 from csplat.model import SplatModel
-from csplat.ply.comments import format_comments, parse_comments
+from csplat.ply.comments import format_comments, parse_comments, unwritten_entries
 from csplat.ply.ply_header import read_ply_header
 from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.spherical_harmonics import SH_C0
@@ -157,19 +157,16 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     findings = [finding for finding in findings if finding.repairable]  # row counts are checked below
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     declared: list[tuple[str, int, list[tuple[str, str]]]] = []
-    comments: list[str] = []
     form = ""  # format named in the header
     for line in lines[1:]:
         words = line.split()
-        if words[:1] == ["comment"]:
-            comments.append(line[len("comment ") :])
-        elif words[:1] == ["format"]:
+        if words[:1] == ["format"]:
             form = " ".join(words[1:])
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= _COUNT_DIGITS:
             declared.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and declared:
             declared[-1][2].append((words[2], _TYPES[words[1]]))
-        elif words and words[0] != "obj_info":
+        elif words and words[0] not in ("comment", "obj_info"):
             raise InputError(f"{path.name}: the header line {line[:80]!r} is not valid in a compressed PLY")
     if form != "binary_little_endian 1.0":
         raise InputError(f"{path.name}: the format is {form[:40]!r}, expected binary_little_endian 1.0")
@@ -182,7 +179,27 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
         offset += count * elements[name].dtype.itemsize
     if offset > size:
         raise InputError(f"{path.name} has {size:,} bytes, its header declares {offset:,}: copy or download it again")
-    return elements, comments, findings + trailing_bytes(size - offset)
+    return elements, header.comments, findings + _other_findings(elements) + trailing_bytes(size - offset)
+
+
+def _other_findings(elements: Mapping[str, _Element]) -> list[Finding]:
+    """Return the findings about elements and columns that are not read."""
+    read = {"chunk": {*_BOUNDS, *_COLOUR_BOUNDS}, "vertex": {*_PACKED_COLUMNS}}
+    if "sh" in elements:
+        read["sh"] = {*(elements["sh"].dtype.names or ())}  # others are refused
+    others = [name for name, element in elements.items() if name not in read and element.count and element.dtype.names]
+    columns = [
+        f"{column} of {name}"
+        for name, element in elements.items()
+        if name in read and element.count
+        for column in element.dtype.names or ()
+        if column not in read[name]
+    ]
+    findings = other_contents([f"elements {list_names(others)}"] if others else [])
+    if columns:
+        lost = f"columns {list_names(columns)}"
+        findings.append(Finding("extra-columns", len(columns), f"{lost}: dropped", "note", lost=(lost,)))
+    return findings
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
@@ -363,4 +380,5 @@ FORMAT = Format(
     carries=frozenset(
         {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "metadata"}
     ),
+    unwritten=unwritten_entries,
 )

@@ -11,9 +11,9 @@ from typing import Any
 
 from csplat.detect import KINDS
 from csplat.errors import InputError
-from csplat.lint import Finding
+from csplat.lint import Finding, list_names
 from csplat.scene import Scene
-from csplat.scene_metadata import SRGB, UNSPECIFIED
+from csplat.scene_metadata import SRGB, UNSPECIFIED, SceneMetadata
 
 #: Splat attributes common to all formats.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -74,6 +74,8 @@ class Format:
         presets: the same format with another precision, by preset; "balanced" is the format itself.
         carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
             `flat`, `colour_space` and `cameras` that the format stores.
+        unwritten: returns the keys of the entries of the metadata that the format does not store although it carries
+            `metadata`.
     """
 
     name: str
@@ -92,6 +94,7 @@ class Format:
     splat_bytes: tuple[float, ...] = ()
     presets: Mapping[str, Format] = field(default_factory=dict)
     carries: frozenset[str] = frozenset()
+    unwritten: Callable[[SceneMetadata], Sequence[str]] = lambda _metadata: ()
 
     def at(self, preset: str) -> Format:
         """Return the format at the precision of a preset; raise an `InputError` if it has no such preset."""
@@ -130,6 +133,8 @@ class Format:
         for name, (words, is_there) in _PARTS.items():
             if name not in self.carries and is_there(scene):
                 lost.append(f"{words} {', '.join(scene.extra)}" if name == "extra" else words)
+        if "metadata" in self.carries and (keys := self.unwritten(scene.metadata)):
+            lost.append(f"metadata {list_names(keys)}")
         return tuple(lost)
 
 

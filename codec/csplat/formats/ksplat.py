@@ -22,7 +22,7 @@ from csplat.errors import InputError
 from csplat.file_source import map_file
 from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.lint import trailing_bytes
+from csplat.lint import other_contents, trailing_bytes
 from csplat.model import SplatModel, normalise_quats
 from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.types import F32, F64
@@ -39,6 +39,7 @@ _POSITION_MAX = 65535  # largest position of 16 bits
 _DEFAULT_SPAN = 32767  # position units from the centre of a block to its faces
 _DEFAULT_SH = 1.5  # SH bytes represent -1.5 to 1.5
 _LARGEST = 1e38  # larger values exceed float32
+_NAMED = 6  # maximum number of headers and sections that a message lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ def _open(path: Path) -> Iterator[Scene]:
     low, high = low or -_DEFAULT_SH, high or _DEFAULT_SH
     if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
         raise InputError(f"{path.name} has SH from {low} to {high}, expected finite numbers, the larger one last")
-    sections, end = _read_sections(path.name, data, level, section_count)
+    sections, end, spare = _read_sections(path.name, data, level, section_count)
     total = sum(len(section.rows) for section in sections)
     if total != count:
         raise InputError(f"{path.name} has {total:,} splats in its sections, its header declares {count:,}")
@@ -123,8 +124,19 @@ def _open(path: Path) -> Iterator[Scene]:
     no_rows = np.empty(0, _row_type(level, 0))
     empty = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
     scene = finite_scene(blocks, decode, empty)
-    scene.findings.extend(trailing_bytes(len(data) - end))
+    scene.findings.extend(
+        [*other_contents([*_unread_bytes(data, section_count), *spare][:_NAMED]), *trailing_bytes(len(data) - end)]
+    )
     yield scene
+
+
+def _unread_bytes(data: Any, section_count: int) -> list[str]:
+    """Describe bytes of the headers that are reserved and not 0; the centre of the scene follows from the splats."""
+    heads = [("the header of the file", bytes(data[_HEADER.size : _HEADER_SIZE]))]
+    for index in range(section_count):
+        start = _HEADER_SIZE + index * _SECTION_SIZE
+        heads.append((f"the header of section {index}", bytes(data[start + _SECTION.size : start + _SECTION_SIZE])))
+    return [f"reserved bytes of {name}" for name, rest in heads if any(rest)]
 
 
 def _row_type(level: int, degree: int) -> np.dtype[Any]:
@@ -141,13 +153,14 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
     )
 
 
-def _read_sections(name: str, data: Any, level: int, section_count: int) -> tuple[list[_Section], int]:
-    """Return the sections and the offset after the last one.
+def _read_sections(name: str, data: Any, level: int, section_count: int) -> tuple[list[_Section], int, list[str]]:
+    """Return the sections, the offset after the last one, and descriptions of rows after their splats that are not 0.
 
     Raises:
         InputError: a section does not fit into the file, or contradicts itself.
     """
     sections: list[_Section] = []
+    spare: list[str] = []
     at = _HEADER_SIZE + section_count * _SECTION_SIZE
     if at > len(data):
         raise InputError(f"{name} declares {section_count:,} sections, too many for its {len(data):,} bytes")
@@ -165,11 +178,13 @@ def _read_sections(name: str, data: Any, level: int, section_count: int) -> tupl
         if head.splats > head.capacity:
             raise InputError(f"{where}: {head.splats:,} splats, but space for {head.capacity:,}")
         rows = np.frombuffer(data, row, head.splats, start)
+        if np.frombuffer(data, np.uint8, at - start - rows.nbytes, start + rows.nbytes).any():
+            spare.append(f"rows after the splats of section {index}")
         if level and head.splats:
             sections.append(_Section(rows, *_read_buckets(where, data, head, centres)))
         else:
             sections.append(_Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0))
-    return sections, at
+    return sections, at, spare
 
 
 def _read_buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:

@@ -34,11 +34,11 @@ from numpy.typing import NDArray
 from csplat.archives import unpacked_limit
 from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.file_source import open_binary
 from csplat.formats.common import MovedSplats, decode_smallest_three, encode_smallest_three, round_to_bytes
 from csplat.formats.format import Format, ValueRange
-from csplat.lint import Finding, trailing_bytes
+from csplat.lint import Finding, other_contents, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.scene_metadata import SceneMetadata
@@ -56,11 +56,13 @@ MAX_FRACTION_BITS = 30
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
-_HEADER_REST = struct.Struct("<I12x")  # version 4: offset of the table of streams
+_HEADER_REST = struct.Struct("<I12s")  # version 4: offset of the table of streams, reserved
 _STREAM = struct.Struct("<QQ")  # entry of that table: packed size, unpacked size
 _RECORD = struct.Struct("<II")  # head of an extension: type, size of its value
 _EXTENDED, _LEVELS = 0x02, 0x80
+_FLAGS = {ANTIALIASED, _EXTENDED, _LEVELS}
 _COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
+_EXTENSION_NAMES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}  # extensions that are not read
 _SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # three letters per number; 0 is unspecified
 _EXTENSION_BYTES = 1 << 20  # maximum size of all extensions together
 _RATIO = 1032  # maximum expansion by deflate; SPZ programs refuse more from Zstandard, too
@@ -83,6 +85,7 @@ class SpzArrays:
         axes: three letters, as in `SplatModel`.
         parts: positions, alphas, colours, scales, rotations and SH, each [N, bytes].
         findings: findings about the file.
+        unread: contents that are left out, in a few words each.
     """
 
     name: str
@@ -95,6 +98,7 @@ class SpzArrays:
     axes: str = SPZ_AXES
     parts: list[U8] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -138,6 +142,7 @@ def read_spz_file(file: BinaryIO, name: str, size: int) -> SpzArrays:
             (_read_streams if packed.version == 4 else _read_arrays)(packed, size, stream)
     except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
         raise InputError(f"{name} is damaged: {str(error) or 'it is truncated'}") from None
+    packed.findings += other_contents(packed.unread)
     if packed.version == 1 and not np.isfinite(packed.means_half).all():
         raise InputError(f"{name} has positions that are NaN or infinite")
     return packed
@@ -166,6 +171,9 @@ def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
     if flags & _LEVELS:
         raise InputError(f"{name} contains Spark's levels of detail in one list, which csplat does not read")
     packed = SpzArrays(name, version, count, degree, bits, flags, streams)
+    rest = {f"flag 0x{bit:02x}": flags & bit for bit in (1 << n for n in range(8)) if bit not in _FLAGS}
+    rest |= {"the reserved byte of the header": version < 4 and streams}
+    packed.unread += [what for what, is_there in rest.items() if is_there]
     unpacked = count * sum(packed.widths)
     allowed = min(_RATIO * size, unpacked_limit(size))
     if unpacked > allowed:
@@ -195,13 +203,15 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
     Raises:
         InputError: the file is truncated, or its table contradicts the header or the size.
     """
-    (table,) = _HEADER_REST.unpack(_read_exactly(packed.name, stream, _HEADER_REST.size))
+    table, reserved = _HEADER_REST.unpack(_read_exactly(packed.name, stream, _HEADER_REST.size))
+    packed.unread += ["the reserved bytes of the header"] if any(reserved) else []
     start = _HEADER.size + _HEADER_REST.size
     if not start <= table <= start + _EXTENSION_BYTES:
         raise InputError(
             f"{packed.name} has its table of streams at byte {table}, expected {start} to {start + _EXTENSION_BYTES}"
         )
-    _read_extensions(packed, _read_exactly(packed.name, stream, table - start))
+    rest = table - start - _read_extensions(packed, _read_exactly(packed.name, stream, table - start))
+    packed.unread += [f"{counted(rest, 'byte')} before the table of streams"] if rest > 0 else []
     sizes = [packed.count * width for width in packed.widths]
     stream_sizes = [part_size for part_size in sizes if part_size]
     rows = [_STREAM.unpack(_read_exactly(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
@@ -223,7 +233,7 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
 
 
 def _read_extensions(packed: SpzArrays, data: bytes) -> int:
-    """Set `axes` of `packed`, skip other extensions, and return the size of all extensions in bytes."""
+    """Set `axes` of `packed`, note other extensions, and return the size of all extensions in bytes."""
     at = 0
     while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
         kind, size = _RECORD.unpack_from(data, at)
@@ -234,6 +244,8 @@ def _read_extensions(packed: SpzArrays, data: bytes) -> int:
             packed.axes = _SYSTEMS[3 * number : 3 * number + 3]
             if not packed.axes:
                 raise InputError(f"{packed.name} has axes number {number}, expected at most {len(_SYSTEMS) // 3 - 1}")
+        else:
+            packed.unread.append(f"extension {_EXTENSION_NAMES.get(kind, f'0x{kind:08X}')} ({counted(size, 'byte')})")
     return at
 
 
@@ -302,7 +314,7 @@ def write_spz(path: Path, scene: Scene, *, version: int, small: bool = False) ->
             return moved.findings(reason)
         streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in parts]
         table = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, parts, strict=True)]
-        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *table, *streams])
+        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size, b""), *table, *streams])
     return moved.findings(reason)
 
 

@@ -217,7 +217,7 @@ def dropped_columns(names: Sequence[str]) -> Finding:
     meaning = _kind_of_columns(names)
     text = f"extra columns {_list_some(names)} are dropped: --keep-extra of csplat encode or keep_extra=True keeps them"
     text += "" if meaning is None else f"; the file contains {meaning}"
-    return Finding("extra-columns", len(names), text, "note")
+    return Finding("extra-columns", len(names), text, "note", lost=(f"extra columns {_list_some(names)}",))
 
 
 def colour_finding(colours: Sequence[str], largest: float, why: str = "") -> Finding:

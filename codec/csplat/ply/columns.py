@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import counted
-from csplat.lint import Finding
+from csplat.lint import Finding, list_names
 from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats, squared_lengths
 from csplat.ply.column_names import ColumnMap, colour_finding, float_columns, plain_name
 from csplat.portable_math import exp, log
@@ -90,7 +90,10 @@ class RowStatistics:
     quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, except 0
     infinite_logits: int = 0
     zero_scales: int = 0
-    normals: int = 0
+    normals: int = 0  # splats with normals other than 0
+    first_normal: NDArray[Any] | None = None  # [1, 3], of the first splat
+    normals_differ: bool = False
+    rounded: set[str] = field(default_factory=set)  # columns of doubles with values that float32 does not hold
     huge: int = 0
     filtered: int = 0
     opacities: tuple[float, float] = _NO_RANGE  # smallest and largest value in the file
@@ -130,12 +133,15 @@ def gather_arrays(
     out = _allocate(count, dtype, columns, keep_extra=keep_extra)
     statistics = RowStatistics() if statistics is None else statistics
     statistics.colour_range = columns.colour_range
+    attributes = (*columns.sh0, *columns.rest, columns.opacity, *columns.scales, *columns.quats)
+    doubles = [name for name in attributes if dtype[name].kind == "f" and dtype[name].itemsize > 4]
     at = 0
     threads = context.thread_count if count * dtype.itemsize > _MANY_BYTES else 1
     with np.errstate(over="ignore", invalid="ignore"):  # `_repair` detects overflow of float32
         for rows, span in _copy_blocks(blocks, columns, out, threads):
             part = _slice_arrays(out, span)
-            statistics.normals += _count_nonzero_rows(rows, columns.normals)
+            _survey_normals(rows, columns.normals, statistics)
+            statistics.rounded |= {name for name in doubles if is_rounded(rows[name])}
             widths = rows[columns.filter_3d].astype(np.float64) if columns.filter_3d else None
             kept_count = _repair(part, columns, statistics, widths)
             if at < span.start:  # rows before were dropped
@@ -396,12 +402,23 @@ def _adjacent(rows: Rows, names: Sequence[str]) -> NDArray[Any] | None:
     return np.ndarray(shape, kind, rows.view(np.uint8).data, start, strides)
 
 
-def _count_nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
-    """Count rows in which a named column is not 0."""
-    nonzero = np.zeros(len(rows), bool)
-    for name in names:
-        nonzero |= rows[name] != 0
-    return int(np.count_nonzero(nonzero))
+def _survey_normals(rows: Rows, names: Sequence[str], statistics: RowStatistics) -> None:
+    """Update the statistics with the normals of a block: normals that are the same for all splats hold nothing."""
+    if not names or not len(rows):
+        return
+    normals = np.stack([rows[name] for name in names], axis=1)
+    if statistics.first_normal is None:
+        statistics.first_normal = normals[:1].copy()
+    statistics.normals += int(np.count_nonzero(normals.any(axis=1)))
+    statistics.normals_differ |= not np.array_equal(
+        normals, np.broadcast_to(statistics.first_normal, normals.shape), equal_nan=True
+    )
+
+
+def is_rounded(values: NDArray[Any]) -> bool:
+    """Return True if float32 rounds values of any shape; splats with values beyond it are dropped."""
+    rounded = values.astype(np.float32)
+    return bool((np.isfinite(rounded) & (rounded != values)).any())
 
 
 def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics, widths: F64 | None) -> int:
@@ -540,18 +557,25 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
     fused = f"the 3D filter of Mip-Splatting: fused into scales and opacities of {counted(s.filtered, 'splat')}"
     huge = f"log scales beyond ± {HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}"
     findings = [
-        Finding("nonfinite-rows", s.nonfinite, f"{nonfinite}: dropped", "repair")
+        Finding("nonfinite-rows", s.nonfinite, f"{nonfinite}: dropped", "repair", lost=(nonfinite,))
         if s.nonfinite < count
         else Finding("nonfinite-rows", count, f"{nonfinite}: none is left; export the scene again", "error"),
         Finding("zero-quats", s.zero_quats, zero, "repair"),
         Finding("unnormalised-quats", s.unnormalised, quats, "note", usual=usual),
         Finding("infinite-logits", s.infinite_logits, logits, "note"),
         Finding("zero-scales", s.zero_scales, flat, "note"),
-        Finding("nonzero-normals", s.normals, normals, "note"),
+        Finding("nonzero-normals", s.normals * s.normals_differ, normals, "note", lost=("normals",)),
+        rounded_doubles(sorted(s.rounded)),
         Finding("filter-3d", s.filtered, fused, "note"),
         Finding("huge-values", s.huge, f"{counted(s.huge, 'splat')} with {huge}", "note"),
     ]
     return [finding for finding in findings if finding.count] + _activation_findings(s, count - s.nonfinite)
+
+
+def rounded_doubles(names: Sequence[str]) -> Finding:
+    """Return the finding about columns of doubles that float32 rounds; it has no count without names."""
+    text, lost = f"{list_names(names)}: doubles, rounded to float32", (f"doubles of {list_names(names)}",)
+    return Finding("double-columns", len(names), text, "note", lost=lost)
 
 
 def _activation_findings(statistics: RowStatistics, kept: int) -> list[Finding]:

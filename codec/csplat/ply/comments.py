@@ -10,8 +10,11 @@
 | `csplat estimated KEY ...` | entries that are estimates: `up` |
 | `csplat colour_space NAME` | as in `SceneMetadata`; absent for sRGB |
 | `csplat semantic NAME SEMANTIC` | what an extra column means; absent if its name says so |
+| `csplat comment TEXT` | a comment that is not printable ASCII |
 | `csplat training {JSON}`, `csplat view {JSON}` | the training (`TrainingRecord`) and the initial view |
 | `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
+
+Headers are ASCII, because plyfile refuses others. TEXT and SEMANTIC are JSON strings if they are not one line of it.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,7 +48,7 @@ from csplat.scene_metadata import (
 from csplat.types import F32, F64
 
 _PREFIX = "csplat"
-_SEMANTIC = "semantic"
+_COMMENT, _SEMANTIC = "comment", "semantic"
 _SHOWN = 80  # maximum number of characters of a comment in a message
 #: nerfstudio's ns-export names the axis that points up. Brush writes the same axis for every scene, so its comment is
 #: ignored.
@@ -103,6 +107,12 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
             fields |= {mode: True} if mode else {}
         elif _VERTICAL_AXIS.fullmatch(comment.strip()) and not by_brush:
             vertical.append(comment.strip())
+        elif words[:2] == [_PREFIX, _COMMENT] and len(words) > 2:
+            others.append(_parse_text(comment, 2))
+        elif words[:2] == [_PREFIX, LICENCE] and len(words) > 2:
+            entries[LICENCE] = _parse_text(comment, 2)
+        elif words[:2] == [_PREFIX, _SEMANTIC] and len(words) > 3:
+            fields.setdefault("semantics", {})[words[2]] = _parse_text(comment, 3)
         elif words[:1] != [_PREFIX] or len(words) < 2 or not _set_field(fields, entries, words[1], words[2:]):
             others.append(comment)
     origin, origin_is_added = fields.pop("origin", None), fields.pop("origin_is_added", False)
@@ -121,9 +131,11 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
         absolute: positions are written with the origin added.
 
     Returns:
-        ASCII lines, in which other characters become question marks. Defaults get no line.
+        Lines of printable ASCII. Defaults get no line.
     """
-    lines = [line for comment in metadata.comments for line in comment.splitlines()]
+    lines = [
+        comment if _is_line(comment) else f"{_PREFIX} {_COMMENT} {json.dumps(comment)}" for comment in metadata.comments
+    ]
     if absolute or any(origin):
         key = "absolute_origin" if absolute else "origin"
         lines.append(f"{_PREFIX} {key} {' '.join(repr(value) for value in origin)}")
@@ -138,19 +150,30 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
     if metadata.colour_space != SRGB:
         lines.append(f"{_PREFIX} colour_space {metadata.colour_space}")
     named = ((name, semantic) for name, semantic in metadata.semantics.items() if name != semantic)
-    lines += [f"{_PREFIX} {_SEMANTIC} {name} {semantic}" for name, semantic in named]
+    lines += [f"{_PREFIX} {_SEMANTIC} {name} {_format_text(semantic)}" for name, semantic in named]
     if metadata.flat:
         lines.append("SplatRenderMode: 2dgs")
     if metadata.antialiased:
         lines.append("SplatRenderMode: mip")
     if metadata.licence is not None:
-        lines.append(f"{_PREFIX} {LICENCE} {' '.join(metadata.licence.split())}")
+        lines.append(f"{_PREFIX} {LICENCE} {_format_text(metadata.licence)}")
     view = metadata.entries.get(VIEW)
     if isinstance(view, dict) and _is_json(view):
         lines.append(f"{_PREFIX} {VIEW} {json.dumps(view)}")
     if metadata.training is not None:
         lines.append(f"{_PREFIX} {TRAINING} {json.dumps(metadata.training.as_json())}")
-    return [line.encode("ascii", "replace").decode("ascii") for line in lines]
+    return lines
+
+
+def unwritten_entries(metadata: SceneMetadata) -> list[str]:
+    """Return the keys of the entries that `format_comments` does not write, or not completely."""
+    try:
+        written = parse_comments(format_comments(metadata, (0.0, 0.0, 0.0), absolute=False)).metadata
+    except InputError:
+        return list(metadata.entries)
+    read = {**written.entries, UP: None if written.stated_up is None else list(written.stated_up)}
+    wanted = {**metadata.entries, UP: None if metadata.stated_up is None else list(metadata.stated_up)}
+    return [key for key in metadata.entries if not _is_json(wanted[key]) or _plain_json(wanted[key]) != read.get(key)]
 
 
 def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, tuple[float, float, float], F64 | None]:
@@ -219,15 +242,32 @@ def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values
         (fields[key],) = _parse_numbers(key, values, 1)
     elif key in ("antialiased", "flat") and not values:
         fields[key] = True
-    elif key == _SEMANTIC and len(values) == 2:
-        fields.setdefault("semantics", {})[values[0]] = values[1]
     elif key == ESTIMATED and values:
         entries[ESTIMATED] = list(values)
-    elif key == LICENCE and values:
-        entries[LICENCE] = " ".join(values)
     else:
         return False
     return True
+
+
+def _is_line(text: str) -> bool:
+    """Return True if a text is a line of a header that every program reads as it is."""
+    return text.isascii() and text.replace("\t", " ").isprintable() and text == text.rstrip()
+
+
+def _format_text(text: str) -> str:
+    """Return a text as `_parse_text` reads it."""
+    is_plain = _is_line(text) and text == text.strip() and text[:1] not in ("", '"')
+    return text if is_plain else json.dumps(text)
+
+
+def _parse_text(comment: str, words: int) -> str:
+    """Return the text after the first words of a comment: a JSON string, or anything else as it is."""
+    text = comment.split(None, words)[words].rstrip()
+    with suppress(ValueError):
+        value = json.loads(text)
+        if isinstance(value, str):
+            return value
+    return text
 
 
 def _parse_up(values: Sequence[str]) -> list[float]:
@@ -263,6 +303,11 @@ def _is_json(value: object) -> bool:
     except (TypeError, ValueError, RecursionError):
         return False
     return True
+
+
+def _plain_json(value: object) -> Any:
+    """Return a value as it comes back from JSON."""
+    return json.loads(json.dumps(value))
 
 
 def _json(comment: str) -> object:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,12 +63,15 @@ class PlyHeader:
         text: the header up to and including the line `end_header`, with the same length as in the file; ASCII.
         is_text: True if the rows are numbers in ASCII.
         elements: the declared elements.
+        comments: the comments and lines of `obj_info`, in the order of the file, without their keyword. Bytes that are
+            not UTF-8 are question marks.
     """
 
     start: int
     text: bytes
     is_text: bool
     elements: list[PlyElement]
+    comments: list[str]
 
     @property
     def end(self) -> int:
@@ -114,10 +118,11 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         oddities.insert(0, "a byte order mark")
     if oddities:
         findings.append(Finding("unusual-header", len(oddities), f"the header has {', '.join(oddities)}", "note"))
-    if not raw.isascii():
-        count = sum(byte > 127 for byte in raw)
-        note = f"{counted(count, 'byte')} of the header are not ASCII: read as question marks"
-        findings.append(Finding("non-ascii-header", count, note, "note"))
+    comments, unread = _parse_comments(_split(text))
+    if unread:
+        note = f"{counted(unread, 'byte')} of the header are not ASCII, nor UTF-8 in a comment"
+        lost = (f"{counted(unread, 'byte')} of names or comments of the header",)
+        findings.append(Finding("non-ascii-header", unread, f"{note}: read as question marks", "note", lost=lost))
     text = text.translate(_ASCII)
     lines = [line.split() for line in _split(text)]
     if sum(words[:1] in ([b"element"], [b"property"]) for words in lines) > _MAX_DECLARED:
@@ -129,7 +134,23 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         raise InputError(f"{path.name}: the count {wrong[:_SHOWN].decode()!r} of an element is not a whole number")
     findings += _count_findings(lines, path.stat().st_size)
     findings += _repeated_names(lines)
-    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
+    is_text = any(words[:2] == [b"format", b"ascii"] for words in lines)
+    return PlyHeader(start, text, is_text, _parse_elements(lines), comments)
+
+
+def _parse_comments(lines: Sequence[bytes]) -> tuple[list[str], int]:
+    """Return the comments among the lines of a header, and the number of bytes outside ASCII that are not read."""
+    comments, unread = [], 0
+    for line in lines:
+        keyword, *_ = line.split(maxsplit=1) or (b"",)
+        data = line.strip()[len(keyword) + 1 :]
+        if keyword in _FREE_TEXT:
+            with suppress(UnicodeDecodeError):
+                comments.append(data.decode("utf-8"))
+                continue
+            comments.append(data.translate(_ASCII).decode("ascii"))
+        unread += sum(byte > 127 for byte in line)
+    return comments, unread
 
 
 def _repeated_names(lines: Sequence[Sequence[bytes]]) -> list[Finding]:
@@ -295,7 +316,8 @@ def parse_text_rows(
         note = f"the rows have {', '.join(oddities)}"
         findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
         if rest:
-            findings.append(Finding("trailing-bytes", rest, f"{rest} bytes after the last row: ignored", "repair"))
+            what = f"{counted(rest, 'byte')} after the last row"
+            findings.append(Finding("trailing-bytes", rest, f"{what}: ignored", "repair", lost=(what,)))
         return rows, findings
     assert first is not None, "_separations returns at least one reading"
     raise first

@@ -12,7 +12,7 @@ import math
 import re
 import textwrap
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -206,11 +206,13 @@ def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False)
         raise _input_error(path, error) from None
     if SPLAT_ELEMENT not in declared:
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
-    others = [element.name for element in declared if element.name != SPLAT_ELEMENT]
+    counts = {element.name: element.count for element in header.elements}
+    names = [one.name for one in declared if one.name != SPLAT_ELEMENT]
+    others = [one.name for one in declared if one.name in names and counts[one.name] and one.properties]
     properties = declared[SPLAT_ELEMENT].properties
     list_findings = _list_findings([prop.name for prop in properties if is_list(prop)])
     if only_splats:
-        _, more = find_columns(row_type(properties), elements=others)
+        _, more = find_columns(row_type(properties), elements=names)
         if any(finding.id == "missing-columns" for finding in more):
             findings += [*_other_findings(others), *list_findings, *more]
             return None
@@ -222,10 +224,7 @@ def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False)
     except _DAMAGED as error:
         raise _input_error(path, error) from None
     findings += [*_other_findings(others, rows.get(_COLOUR_SPACE)), *list_findings]
-    comments = [*declared.comments, *declared.obj_info]
-    for element in declared:
-        comments += element.comments
-    return PlyContent(rows.get(SPLAT_ELEMENT, np.empty(0, [])), comments, others)
+    return PlyContent(rows.get(SPLAT_ELEMENT, np.empty(0, [])), header.comments, names)
 
 
 def _input_error(path: Path, error: Exception) -> InputError:
@@ -358,7 +357,8 @@ def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
     arrays = gather_arrays([], 0, ply.rows.dtype, ply.columns, keep_extra=True)
     means, origin, doubles = split_origin(arrays.means, ply.comments)
     if survey.positions is not None:
-        origin, doubles = survey.positions[1], None
+        origin, doubles = survey.positions[1], survey.positions[2]
+        doubles = None if doubles is None else doubles[:0]
     return _build_model(arrays, (means, origin, doubles), ply)
 
 
@@ -535,8 +535,8 @@ def _row_finding(error: Any, words: list[str]) -> Finding:
 
 def _list_findings(names: list[str]) -> list[Finding]:
     """Report lists of splats."""
-    text = f"list properties {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
-    return [Finding("list-columns", len(names), text, "repair")] if names else []
+    what = f"list properties {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}"
+    return [Finding("list-columns", len(names), f"{what}: dropped", "repair", lost=(what,))] if names else []
 
 
 def _other_findings(names: list[str], colour_space: Rows | None = None) -> list[Finding]:
@@ -548,12 +548,13 @@ def _other_findings(names: list[str], colour_space: Rows | None = None) -> list[
     """
     if not names:
         return []
-    text = f"elements besides {SPLAT_ELEMENT}: {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
+    shown = textwrap.shorten(", ".join(names), _SHOWN_NAMES)
+    text, lost = f"elements besides {SPLAT_ELEMENT}: {shown}: dropped", (f"elements {shown}",)
     if not set(names) <= _SHARP:
         if any(name.startswith(_FRAME) for name in names):
             text += "; they move the splats, of which the first frame is kept"
-        return [Finding("other-elements", len(names), text, "repair")]
-    findings = [Finding("sharp-elements", len(names), f"{text}; they are the camera of ml-sharp", "note")]
+        return [Finding("other-elements", len(names), text, "repair", lost=lost)]
+    findings = [Finding("sharp-elements", len(names), f"{text}; they are the camera of ml-sharp", "note", lost=lost)]
     if colour_space is None:
         return findings
     linear = colour_space[_COLOUR_SPACE][colour_space[_COLOUR_SPACE] != _SRGB]
@@ -577,8 +578,8 @@ def _trailing_findings(path: Path, header: PlyHeader, end: int) -> list[Finding]
 
 def _rest_findings(count: int) -> list[Finding]:
     """Report `count` bytes after the last row; no finding for 0."""
-    text = f"{counted(count, 'byte')} after the last row: ignored"
-    return [Finding("trailing-bytes", count, text, "repair")] if count else []
+    what = f"{counted(count, 'byte')} after the last row"
+    return [Finding("trailing-bytes", count, f"{what}: ignored", "repair", lost=(what,))] if count else []
 
 
 def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:

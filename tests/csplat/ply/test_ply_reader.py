@@ -90,14 +90,14 @@ def test_reads_more_rows_than_one_block_and_columns_by_name_in_any_order(tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
-def test_header_comments_are_kept_in_ascii(tmp_path, kind):
+def test_header_comments_are_kept(tmp_path, kind):
     comments = ["made by", "a machine", "end_header", "é end_header", "café"]
     names, rows = written(tmp_path / "a.ply", 0, kind=kind, comments=comments)
     report = []
     model = read_ply(tmp_path / "a.ply", strict=True, report=report)
     assert_holds(model, names, rows)
-    assert ["made by", "a machine", "end_header", "?? end_header", "caf??"] == model.metadata.entries["comments"]
-    assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
+    assert comments == model.metadata.entries["comments"]
+    assert {"unnormalised-quats"} == {one.id for one in report}
     write_ply(tmp_path / "b.ply", model)
     assert model.metadata == read_ply(tmp_path / "b.ply").metadata
 

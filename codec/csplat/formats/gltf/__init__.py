@@ -16,6 +16,7 @@ from csplat.formats.gltf.gltf_document import AXES
 from csplat.formats.gltf.gltf_reader import open_gltf
 from csplat.formats.gltf.gltf_writer import keeps_file, write_compressed_gltf, write_gltf
 from csplat.ply.columns import HUGE_LOG, LOG_OF_0, LOG_OF_LARGEST
+from csplat.ply.comments import unwritten_entries
 
 FORMAT = Format(
     name="gltf",
@@ -29,6 +30,7 @@ FORMAT = Format(
     carries=frozenset(
         {"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "colour_space", "metadata"}
     ),
+    unwritten=unwritten_entries,
 )
 COMPRESSED_FORMAT = replace(
     FORMAT,
@@ -39,4 +41,5 @@ COMPRESSED_FORMAT = replace(
     exact=frozenset(),
     splat_bytes=(7.0, 8.0, 9.0, 10.0),
     carries=FORMAT.carries | {"extra", "cameras"},
+    unwritten=lambda _metadata: (),
 )

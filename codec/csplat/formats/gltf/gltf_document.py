@@ -41,8 +41,10 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # properties of a node
 _NUMBER_MAX = 1e300  # refuses NaN, infinity and integers that exceed float64
 _MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference a mesh very often
+_MAX_CHUNKS = 64  # chunks of a .glb that are listed; two are read
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
-_INSTANCING = "EXT_mesh_gpu_instancing"
+#: Extensions of nodes: copies of a mesh, and whether a node is shown.
+INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,7 @@ class GltfDocument:
         root: the JSON.
         binary: the chunk BIN; `None` if there is none.
         tail: number of bytes after the declared end of a .glb.
+        chunks: types of the chunks of a .glb that are not read.
         short: by index, messages about used buffers that are shorter than declared.
     """
 
@@ -102,6 +105,7 @@ class GltfDocument:
     root: dict[str, Any]
     binary: memoryview | None
     tail: int = 0
+    chunks: tuple[str, ...] = ()
     short: dict[int, str] = field(default_factory=dict)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
@@ -268,7 +272,7 @@ class GltfDocument:
         while stack:
             index, above = stack.pop()
             node, json_path = self.item("nodes", index), ("nodes", _shorten(index))
-            if _extension(node, "KHR_node_visibility").get("visible") is False:
+            if _extension(node, VISIBILITY).get("visible") is False:
                 continue
             if index in seen:
                 raise self.error(json_path, "it has more than one parent")
@@ -301,10 +305,10 @@ class GltfDocument:
 
     def instances(self, placed: PlacedPrimitive) -> NDArray[np.float64]:
         """Return the matrices [I, 4, 4] from a primitive to the world, for each instance of EXT_mesh_gpu_instancing."""
-        extension = _extension(placed.node, _INSTANCING)
+        extension = _extension(placed.node, INSTANCING)
         if not extension:
             return placed.matrix[None]
-        json_path = (*placed.node_path, "extensions", _INSTANCING)
+        json_path = (*placed.node_path, "extensions", INSTANCING)
         attributes = self.get(extension, json_path, "attributes", dict, {})
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
         rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
@@ -375,7 +379,7 @@ def open_document(path: Path) -> GltfDocument:
         OSError: the file cannot be read.
     """
     data = memoryview(map_file(path))
-    text, binary, tail = _split_chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
+    text, binary, tail, chunks = _split_chunks(path, data) if data[:4] == MAGIC else (data, None, 0, ())
     try:
         root = parse_json(bytes(text))
     except InputError as error:
@@ -385,11 +389,11 @@ def open_document(path: Path) -> GltfDocument:
     version = root["asset"].get("version")
     if not isinstance(version, str) or version.partition(".")[0] != str(_VERSION):
         raise InputError(f"{path.name} is glTF {_shorten(version)}, expected {_VERSION}.0")
-    return GltfDocument(path, root, binary, tail)
+    return GltfDocument(path, root, binary, tail, chunks)
 
 
-def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None, int]:
-    """Return the chunks JSON and BIN of a .glb, and the number of bytes after its declared end.
+def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None, int, tuple[str, ...]]:
+    """Return the chunks JSON and BIN of a .glb, the number of bytes after its end, and the types of other chunks.
 
     BIN is `None` if it is not the second chunk. Zeros after the JSON are removed.
 
@@ -405,7 +409,7 @@ def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview 
         raise InputError(f"{path.name} is truncated: found {len(data)} bytes, expected {size}")
     chunks: list[tuple[bytes, memoryview]] = []
     at = GLB_HEAD.size
-    while at + _CHUNK_HEAD.size <= size and len(chunks) < 2:  # further chunks are ignored
+    while at + _CHUNK_HEAD.size <= size and len(chunks) < _MAX_CHUNKS:
         length, kind = _CHUNK_HEAD.unpack_from(data, at)
         at += _CHUNK_HEAD.size
         if length > size - at:
@@ -418,7 +422,8 @@ def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview 
         raise InputError(f"{path.name}: the first chunk is not JSON")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == BIN else None
     text = bytes(chunks[0][1]).rstrip(b"\0")  # some exporters pad with zeros instead of spaces
-    return memoryview(text), binary, len(data) - size
+    others = tuple(kind.decode("ascii", "replace") for kind, part in chunks[1 if binary is None else 2 :] if len(part))
+    return memoryview(text), binary, len(data) - size, others
 
 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 """Read splats from glTF: accessors of KHR_gaussian_splatting, a .csplat file (`spec/gltf.md`), or SPZ under any name
 that its extension has had.
 
-Everything that splats do not use (meshes, materials, their compression) is ignored, even required extensions.
+Everything that splats do not use (meshes, materials, their compression) is left out, even what required extensions
+specify, and listed (`gltf_remainder`).
 
 The SPZ extension specifies that positions are unpacked along LUF; CesiumJS and its tilesets use them as stored. The
 bounds of POSITION, which glTF requires, tell the two cases apart.
@@ -38,6 +39,7 @@ from csplat.errors import InputError, counted
 from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales, log_scales
 from csplat.formats.gltf.csplat_payload import (
     COMPRESSION,
+    attribute_types,
     check_primitive,
     open_payload,
     payload_bounds,
@@ -47,6 +49,8 @@ from csplat.formats.gltf.csplat_payload import (
 from csplat.formats.gltf.gltf_document import (
     AXES,
     EXTENSION,
+    INSTANCING,
+    VISIBILITY,
     Accessor,
     GltfDocument,
     JsonPath,
@@ -55,13 +59,14 @@ from csplat.formats.gltf.gltf_document import (
     open_document,
     sh_names,
 )
+from csplat.formats.gltf.gltf_remainder import ReadPrimitive, list_remainder
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
-from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
+from csplat.lint import Finding, list_names, other_contents, too_many_bands, trailing_bytes
+from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats, splat_dtype
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene import BLOCK_SPLATS, Scene, join_blocks
-from csplat.scene_metadata import LICENCE, LINEAR, SRGB, SceneMetadata
+from csplat.scene_metadata import LINEAR, SRGB, SceneMetadata
 from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat.splat_file import SplatFile
 from csplat.types import F32, F64
@@ -82,6 +87,7 @@ _ALIKE = 0.1  # fraction of the scene's extent by which equivalent bounds may di
 _STRETCHES = (1e-30, 1e30)  # range of the largest singular value of a node's transform: beyond, products may
 _SINGULAR = 1e-9  # a transform whose singular values have a smaller ratio is singular
 _SAMPLE = 4096  # number of splats on which the error of fitted colours is measured
+_COLOUR_ERROR = 2.0 / 255.0  # largest error of colours of points: they are bytes, rounded up or down
 _SHOWN_NAME = 60  # characters of a program's name in messages
 _UNPACKED_RATIO = 1032  # maximum expansion by deflate; exceeded if several views share their bytes
 
@@ -144,6 +150,8 @@ class _GltfReading:
         linear_samples: functions that decode some splats of each primitive with linear colours.
         packed: SPZ by index of their buffer views.
         files: .csplat files by index of their buffer views.
+        primitives: the primitives of splats, with the attributes that are read.
+        unread: contents that are left out, in a few words each.
     """
 
     file: GltfDocument
@@ -160,6 +168,8 @@ class _GltfReading:
     linear_samples: list[Callable[[], SplatModel]] = field(default_factory=list)
     packed: dict[int, SpzArrays] = field(default_factory=dict)
     files: dict[int, SplatFile] = field(default_factory=dict)
+    primitives: list[ReadPrimitive] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)
     count: int = 0
     unpacked_bytes: int = 0
 
@@ -179,17 +189,24 @@ class _GltfReading:
         has_file = COMPRESSION in within
         self._check(placed, extension, (*json_path, EXTENSION), packed=bool(packed) and not has_file)
         bad = infinite = 0
+        attributes = self.file.get(placed.primitive, placed.json_path, "attributes", dict, {})
+        names = {name for name in attributes if name == "POSITION" or name.startswith(f"{EXTENSION}:")}
         if has_file:
             splats = self._payload(placed)
+            header = self.files[payload_view(self.file, placed)].header
+            names = set(attribute_types(header))
         elif packed:
             inner = (*json_path, packed) if packed in extensions else (*json_path, EXTENSION, "extensions", packed)
             holder = within if packed in within else extensions
             view = self.file.integer(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
             splats = _Splats.of_rows(*self._packed_block(placed, view, draft="kernel" not in extension))
         else:
-            block, count, (bad, infinite) = self._plain_block(placed)
+            block, count, (bad, infinite), plain_names = self._plain_block(placed)
             splats = _Splats.of_rows(block, count)
+            names = plain_names if self.sh_degree is None else names  # which has bands that are left out on request
         count = splats.count
+        names |= {name for name in ("COLOR_0", "NORMAL") if name in attributes and self._holds_nothing(placed, name)}
+        self.primitives.append(ReadPrimitive(placed, frozenset(names)))
         if extension.get("colorSpace") == LINEAR:
             self.linear_samples.append(partial(_sample, splats))
             splats = _in_srgb(splats)
@@ -232,11 +249,14 @@ class _GltfReading:
                 expected = " or ".join(sorted(allowed for allowed in values if allowed))
                 raise self.file.error((*json_path, key), f"found {value!r}, expected {expected}")
 
-    def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
+    def _plain_block(
+        self, placed: PlacedPrimitive
+    ) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int], set[str]]:
         """Check a primitive with plain accessors.
 
         Returns:
-            A function that decodes rows; the number of rows; and the numbers of rows that `_survey` returns.
+            A function that decodes rows; the number of rows; the numbers of rows that `_survey` returns; and the names
+            of the attributes that are read.
         """
         file, json_path = self.file, (*placed.json_path, "attributes")
         attributes = file.get(placed.primitive, placed.json_path, "attributes", dict, {})
@@ -259,7 +279,48 @@ class _GltfReading:
                 raise file.error(json_path, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
         if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(degree + 1)) and self.sh_degree is None:
             raise file.error(json_path, too_many_bands(degree + 1))
-        return partial(_decode_block, self, arrays, degree), count, self._survey(arrays, count)
+        return (
+            partial(_decode_block, self, arrays, degree),
+            count,
+            self._survey(arrays, count),
+            set(map(attribute_name, arrays)),
+        )
+
+    def _holds_nothing(self, placed: PlacedPrimitive, name: str) -> bool:
+        """Return True for normals that are the same for all splats, and for the colours of points that follow from SH.
+
+        KHR_gaussian_splatting lets writers add COLOR_0 for programs that draw points: light, or values of sRGB.
+        """
+        attributes = placed.primitive["attributes"]
+        try:
+            kind = self.file.item("accessors", attributes[name]).get("type")
+            rows = self.file.accessor(attributes[name], 4 if kind == "VEC4" else 3)
+            if name == "NORMAL":
+                return np.array_equal(rows.rows, np.broadcast_to(rows.rows[:1], rows.rows.shape), equal_nan=True)
+            needed = [attribute_name(source) for source in ("SH_DEGREE_0_COEF_0", "OPACITY")]
+            sh0, opacities = (
+                self.file.accessor(attributes[one], width) for one, width in zip(needed, (3, 1), strict=True)
+            )
+        except (InputError, KeyError):
+            return False
+        shown = dict.fromkeys(("display", "light", "alpha", "logit", "opaque"), True)
+        for start in range(0, min(len(rows.rows), len(sh0.rows), len(opacities.rows)), BLOCK_SPLATS):
+            part = slice(start, start + BLOCK_SPLATS)
+            colours = np.clip(sh0.values(part) * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+            values, alphas = rows.values(part), opacities.values(part)[:, 0]
+            alpha = values[:, 3] if values.shape[1] == 4 else np.ones_like(alphas)
+            with np.errstate(over="ignore", invalid="ignore"):
+                candidates = {
+                    "display": np.abs(values[:, :3] - colours),
+                    "light": np.minimum(
+                        np.abs(_srgb(np.maximum(values[:, :3], 0)) - colours), np.abs(values[:, :3] - _light(colours))
+                    ),
+                    "alpha": np.abs(alpha - alphas),
+                    "logit": np.abs(alpha - alpha_of_logits(alphas)),
+                    "opaque": np.abs(alpha - 1),
+                }
+            shown = {name: shown[name] and not (error > _COLOUR_ERROR).any() for name, error in candidates.items()}
+        return (shown["display"] or shown["light"]) and (shown["alpha"] or shown["logit"] or shown["opaque"])
 
     def _survey(self, arrays: dict[str, Accessor], count: int) -> tuple[int, int]:
         """Update the statistics with the rows of a primitive.
@@ -350,6 +411,8 @@ class _GltfReading:
             if self.unpacked_bytes > _UNPACKED_RATIO * file.size():
                 raise InputError(f"{file.path.name}: its SPZ share their bytes and unpack to too many splats")
             self.packed[view] = packed
+            for finding in packed.findings:
+                self._report(finding)
             self.antialiased.append(bool(packed.flags & ANTIALIASED))
         packed = self.packed[view]
         degree = packed.degree if self.sh_degree is None else min(packed.degree, self.sh_degree)
@@ -411,6 +474,7 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         empty = _describe_scene(reading, instances)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
+    reading.findings += other_contents(reading.unread)
 
     def blocks() -> Iterator[SplatModel]:
         for instance in instances:
@@ -441,15 +505,29 @@ def _describe_scene(reading: _GltfReading, instances: list[_Instance]) -> SplatM
     if comments.origin is None and (has_origin or np.abs(first.translation).max() >= _FAR):
         origin = first.translation
     x, y, z = origin.tolist()
-    extras = [{name: column.dtype for name, column in one.splats.empty.extra.items()} for one in instances]
     empty = _pad_bands(first.splats.empty, max(one.splats.empty.sh_degree for one in instances))
-    if any(extra != extras[0] for extra in extras):
+    columns = [_columns(one.splats.empty) for one in instances]
+    if any(one != columns[0] for one in columns):
+        names = sorted({name for one in columns for name, _, _ in one})
+        reading.unread.append(f"extra columns {list_names(names)}, which differ between its primitives")
         empty = replace(empty, extra={})
-    if payload is not None and len(instances) == 1:
+    semantics = {name: semantic for name, _, semantic in columns[0] if semantic and empty.extra}
+    metadata = replace(metadata, semantics=semantics)
+    is_payload = payload is not None and len(instances) == 1
+    if payload is not None and is_payload:
         placed = stretch_scene(payload, first.linear)
         dx, dy, dz = (first.translation - origin).tolist()
         metadata = translate_scene(placed, (dx, dy, dz)).metadata
         metadata = replace(metadata, unit_metres=None if metadata.unit_metres is None else 1.0)
+    elif any(opened.metadata.entries or opened.metadata.cameras for opened in reading.files.values()):
+        reading.unread.append("metadata of its .csplat files")
+    metadata = _with_copyright(reading, metadata)
+    reading.unread += list_remainder(
+        reading.file,
+        reading.primitives,
+        [EXTENSION, COMPRESSION, *_SPZ, INSTANCING, VISIBILITY],
+        comments=not is_payload,
+    )
     antialiased = metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
     metadata = replace(metadata, coordinate_system=AXES, antialiased=antialiased)
     if metadata.colour_space == LINEAR:
@@ -480,7 +558,9 @@ def _conclude(reading: _GltfReading) -> None:
     reading.findings += [*scale_findings, *opacity_findings, *list_findings(reading.statistics, reading.count)]
     reading.findings += trailing_bytes(reading.file.tail)
     if others := reading.file.other_scenes():
-        reading.findings.append(Finding("other-scenes", len(reading.file.root["scenes"]) - 1, others, "note"))
+        more = len(reading.file.root["scenes"]) - 1
+        lost = (counted(more, "other scene"),)
+        reading.findings.append(Finding("other-scenes", more, others, "note", lost=lost))
     if reading.linear_samples and all(finding.repairable for finding in reading.findings):
         try:
             error = max(
@@ -585,8 +665,14 @@ def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> S
     return replace(block, origin=empty.origin, metadata=empty.metadata, extra=extra)
 
 
+def _columns(empty: SplatModel) -> list[tuple[str, np.dtype[Any], str]]:
+    """Return name, type and semantic of the extra columns of a model."""
+    semantics = empty.metadata.semantics
+    return [(name, splat_dtype(column), semantics.get(name, "")) for name, column in empty.extra.items()]
+
+
 def _read_comments(file: GltfDocument) -> CommentMetadata:
-    """Read the metadata that our writer adds to the asset; without a licence there, its copyright is the licence.
+    """Read the metadata that our writer adds to the asset.
 
     Raises:
         InputError: the metadata is not a list of strings, or a string is not a valid comment.
@@ -595,11 +681,17 @@ def _read_comments(file: GltfDocument) -> CommentMetadata:
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError("asset/extras/csplat is not a list of strings")
-    comments = parse_comments(lines)
-    holder = file.root["asset"].get("copyright")
-    if isinstance(holder, str) and LICENCE not in comments.metadata.entries:
-        return replace(comments, metadata=comments.metadata.with_entries(licence=holder))
-    return comments
+    return parse_comments(lines)
+
+
+def _with_copyright(reading: _GltfReading, metadata: SceneMetadata) -> SceneMetadata:
+    """Return the metadata with the copyright of the asset, which every program shows, as its licence."""
+    holder, licence = reading.file.root["asset"].get("copyright"), metadata.licence
+    if not isinstance(holder, str) or holder == licence:
+        return metadata
+    if licence is not None and licence != holder.encode("ascii", "replace").decode("ascii"):
+        reading.unread.append(f"the licence {list_names([licence])}, which asset copyright contradicts")
+    return metadata.with_entries(licence=holder)
 
 
 _DIRECTIONS = 96  # six per coefficient of degree 3; 1,000 would change the colours of a scene by 0.01 of 255 steps
@@ -636,6 +728,16 @@ def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
             coefficients = inverse @ (exact - np.float32(0.5))
             fitted = basis @ coefficients + np.float32(0.5)
         yield coefficients, fitted, exact
+
+
+def _light(colours: F32) -> F32:
+    """Invert `_srgb`."""
+    light: F32 = np.where(
+        colours <= np.float32(0.04045),
+        colours / np.float32(12.92),
+        ((colours + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4),
+    )
+    return light
 
 
 def _srgb(linear: F32) -> F32:

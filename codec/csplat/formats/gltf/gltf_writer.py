@@ -259,7 +259,7 @@ def _build_json(
         bounds: least and largest position, [3] each.
     """
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
-    lines = format_comments(scene.metadata, scene.origin, absolute=False)
+    lines = format_comments(scene.metadata.with_entries(licence=None), scene.origin, absolute=False)
     if scene.metadata.licence is not None:
         asset["copyright"] = scene.metadata.licence
     kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}

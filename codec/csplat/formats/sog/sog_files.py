@@ -30,6 +30,7 @@ _LARGEST_NUMBER = 1e30  # largest magnitude of a number in the JSON, well within
 _RIFF_HEAD_SIZE = 12  # bytes before the first chunk of a WebP
 _ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of a single scene, and of a scene in levels
 _OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
+_OF_SYSTEMS = {_OF_MACOS.casefold(), ".ds_store", "thumbs.db"}  # what systems add to folders: attributes, icons
 _NAMED = 5  # maximum number of scenes that a message lists
 _EXPANSION = 4  # maximum expansion of a zip member: images and short texts do not compress further
 _FREE = 1 << 20  # bytes of a member that are accepted regardless of its expansion
@@ -200,6 +201,27 @@ class SogParts:
         except DAMAGED as error:
             self.refuse(f"{name[:_SHOWN]}: {' '.join(str(error).split())[:_SHOWN_REASON] or type(error).__name__}")
 
+    def unread_members(self, used: Sequence[str], folders: Sequence[PurePosixPath] = ()) -> list[str]:
+        """Return the members of the zip that have bytes and are not used; none without a zip.
+
+        Args:
+            used: names of the parts that are used.
+            folders: folders relative to this one; everything in them is used.
+        """
+        if self.folder is None or self.zip is None:
+            return []
+        sizes = {use_slashes(info.filename): info.file_size for info in self.zip.members}
+        paths = {name: PurePosixPath(name.casefold()) for name, size in sizes.items() if size}
+        known = {PurePosixPath(str(self.folder / use_slashes(name)).casefold()) for name in used}
+        inside = [PurePosixPath(str(self.folder / folder).casefold()) for folder in folders]
+        scenes = set(scenes_of(sizes))  # `_report_others` names them
+        return [
+            name
+            for name, path in paths.items()
+            if path not in known and name not in scenes and not _OF_SYSTEMS.intersection(path.parts)
+            if not any(path.is_relative_to(folder) for folder in inside)
+        ]
+
     def json(self, name: str) -> JsonValue:
         """Read and parse a JSON part."""
         data = self.read(name, _LARGEST_JSON)
@@ -305,8 +327,9 @@ def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -
         return []
     if not all(other.is_relative_to(only.parent) for other in others):
         _refuse_several(parts, [only, *others])
-    text = f"the zip also holds {_list_paths(others)}: not read"
-    return [Finding("other-scenes", len(others), text, "note")]
+    shown = _list_paths(others)
+    text, lost = f"the zip also holds {shown}: not read", (f"files {shown} of the zip",)
+    return [Finding("other-scenes", len(others), text, "note", lost=lost)]
 
 
 def _is_manifest(path: PurePosixPath) -> bool:

@@ -8,10 +8,10 @@ SOG.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import counted
 from csplat.formats.common import crossed_bounds, decode_smallest_three
 from csplat.formats.sog.sog_files import JsonValue, SogParts, decode_webp, find_parts, use_slashes
-from csplat.lint import Finding
+from csplat.lint import Finding, list_names, other_contents
 from csplat.model import SplatModel
 from csplat.ply.columns import alpha_of_logits
 from csplat.portable_math import exp
@@ -33,6 +33,24 @@ _MAX_OFFSET = 1 << 40  # splats
 _MAX_VERSION = 1 << 30  # larger numbers are no versions
 _CODES = 256  # codes of a byte of an image
 _KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # a meta.json of another program has none of these
+_SECTIONS = ("means", "scales", "quats", "sh0", "shN")
+#: Keys that are read, or say by which program or how the file was made.
+_KNOWN_KEYS = {"version", "asset", "generator", "count", "antialias", "model", *_SECTIONS}
+_SECTION_KEYS = {"files", "shape", "dtype", "mins", "maxs", "codebook", "count", "bands", "encoding", "quantization"}
+_ASSET_KEYS = {"generator", "version"}
+_STREAMED_KEYS = {
+    "version",
+    "asset",
+    "generator",
+    "count",
+    "counts",
+    "lodErrors",
+    "lodLevels",
+    "filenames",
+    "environment",
+    "tree",
+}
+_NOTHING: tuple[object, ...] = (None, {}, [], "")  # values of keys that hold nothing
 _SHOWN = 80  # characters of a name in messages
 _Range = tuple[int, int, int]  # file index, first splat, end
 
@@ -85,7 +103,10 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: 
         parts.refuse(f"{name} is not the one of SOG, which has {', '.join(_KEYS[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
         scene = _open_streamed(parts, meta, level, max_splats)
-        scene.findings.extend(parts.findings)
+        folders = [PurePosixPath(use_slashes(item.text())).parent for item in meta["filenames"].list()]
+        folders += [PurePosixPath(use_slashes(meta["environment"].text())).parent] if "environment" in meta else []
+        members = parts.unread_members([name], folders) if all(folder.parts for folder in folders) else []
+        scene.findings.extend([*parts.findings, *_other_findings(_unread_keys(meta, _STREAMED_KEYS), members)])
         return scene
     if level:
         parts.refuse(f"it has no levels: level {level} cannot be read")
@@ -98,7 +119,28 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: 
         for arrays in images.blocks(degree):
             yield SplatModel(**arrays, metadata=metadata)
 
-    return Scene(sog.count, degree, blocks, metadata, findings=[*parts.findings, *_list_findings(images)])
+    used = [
+        file.text() for key in _SECTIONS if key in meta and "files" in meta[key] for file in meta[key]["files"].list()
+    ]
+    others = _other_findings(_unread_keys(meta), parts.unread_members([name, *used]))
+    return Scene(sog.count, degree, blocks, metadata, findings=[*parts.findings, *others, *_list_findings(images)])
+
+
+def _unread_keys(meta: JsonValue, known: Collection[str] = _KNOWN_KEYS) -> list[str]:
+    """Return the keys of a SOG's JSON, and of its sections, that have a value and are not read."""
+    whole = meta.value
+    unread = [key for key, value in whole.items() if key not in known and value not in _NOTHING]
+    for section, read in (("asset", _ASSET_KEYS), *((name, _SECTION_KEYS) for name in _SECTIONS)):
+        inside = whole.get(section)
+        if section in known and isinstance(inside, dict):
+            unread += [f"{section} {key}" for key, value in inside.items() if key not in read and value not in _NOTHING]
+    return unread
+
+
+def _other_findings(keys: Sequence[str], members: Sequence[str]) -> list[Finding]:
+    """Return the finding about keys of the JSON and members of the zip that are not read, if there are any."""
+    contents = [f"keys {list_names(keys)} of the JSON"] if keys else []
+    return other_contents([*contents, *([f"files {list_names(members)} of the zip"] if members else [])])
 
 
 def _list_findings(images: SogImages) -> list[Finding]:
@@ -142,6 +184,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
         if end > sog.count:
             parts.refuse(f"the level uses splats up to {end:,} of {name}, which has {sog.count:,}")
         metas.append((sog, used_ranges))
+        findings += [one for one in _other_findings(_unread_keys(sog.meta), ()) if one not in findings]
     degree = max([read_degree(sog) for sog, _ in metas], default=0)
     metadata = SceneMetadata(
         antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
