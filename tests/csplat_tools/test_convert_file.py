@@ -396,6 +396,65 @@ def test_compress_makes_a_glb_of_a_csplat_file(tmp_path, make_model):
         assert (2, True) == (refused.exit_code, message in " ".join(refused.output.split()))
 
 
+def directions_of(model):
+    """Return what normals and displacements mean: where they point to, relative to the means, and squared lengths."""
+    return {name: model.extra[name].reshape(len(model), -1, 3).astype("f8") for name in ("normal", "motion", "flow")}
+
+
+def test_normals_and_displacements_change_with_the_options_and_nodes(tmp_path, make_model):
+    rng = np.random.default_rng(4)
+    extra = {"normal": rng.standard_normal((30, 3)).astype("f4"), "motion": rng.standard_normal((30, 6)).astype("f4")}
+    extra |= {"flow": rng.standard_normal((30, 3)).astype("f4"), "other": rng.standard_normal((30, 3)).astype("f4")}
+    model = make_model(30, 0, extra=extra, semantics={"flow": "motion"}, coordinate_system="RDF")
+    write_ply(tmp_path / "a.ply", model)
+
+    def check(path, changed, linear, atol=1e-5):
+        before, after = directions_of(path), directions_of(changed)
+        mapped = {name: before[name] @ linear.T for name in ("motion", "flow")}
+        normals = before["normal"] @ np.linalg.inv(linear)
+        lengths = np.linalg.norm(before["normal"], axis=2) / np.linalg.norm(normals, axis=2)
+        for name, values in (mapped | {"normal": normals * lengths[..., None]}).items():
+            np.testing.assert_allclose(after[name], values, rtol=1e-4, atol=atol)
+        assert (path.extra["other"] == changed.extra["other"]).all()
+
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    for words, linear in (
+        (("--to-axes", "RUB"), np.diag([1, -1, -1])), (("--to-axes", "LUF"), np.diag([-1, -1, 1])),
+        (("--to-axes", "FRU"), np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])), (("--rotate", "0,0,90"), quarter),
+        (("--scale", "3"), 3 * np.eye(3)), (("--translate", "1,2,3"), np.eye(3)), (("--axes", "RUB"), np.eye(3)),
+        (("--rotate", "0,0,90", "--scale", "0.5", "--to-axes", "RUB"), 0.5 * quarter @ np.diag([1, -1, -1])),
+    ):  # fmt: skip
+        call("convert", tmp_path / "a.ply", tmp_path / "b.ply", *words, "--force")
+        check(model, read_ply(tmp_path / "b.ply", keep_extra=True), linear)
+        call("encode", tmp_path / "b.ply", tmp_path / "b.csplat", "--keep-extra", "--force")
+        check(model, decode(tmp_path / "b.csplat").select(order_of(tmp_path / "b.ply", tmp_path / "b.csplat")), linear)
+    call("convert", tmp_path / "a.ply", tmp_path / "b.glb", "--compress")
+    data = (tmp_path / "b.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    plain, turn = csplat.read(tmp_path / "b.glb"), np.diag([-1.0, -1, 1])  # RDF to glTF's axes and back
+    for at in range(12):
+        nodes = np.linalg.qr(rng.standard_normal((3, 3)))[0] if at % 3 == 0 else rng.standard_normal((3, 3)) * (1 + at)
+        root, columns = json.loads(data[20 : 20 + size]), np.eye(4)
+        columns[:3, :3], columns[3, :3] = nodes.T, rng.standard_normal(3)
+        root["nodes"][0]["matrix"] = columns.ravel().tolist()
+        if at % 2:  # shown twice
+            root["nodes"].append(dict(root["nodes"][0]))
+            root["scenes"][0]["nodes"].append(1)
+        text = json.dumps(root).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + size :]
+        (tmp_path / "c.glb").write_bytes(data[:8] + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+        changed = csplat.read(tmp_path / "c.glb")
+        assert {"flow": "motion", "normal": "normal", "motion": "motion"} == changed.metadata.semantics
+        check(plain, changed.select(slice(len(changed) - 30, None)), turn @ nodes @ turn, atol=1e-4)
+
+
+def order_of(ply, file):
+    """Return the index in a .csplat file of each splat of a PLY, whose extra columns are kept bit for bit."""
+    rows = [model.extra["other"] for model in (read_ply(ply, keep_extra=True), decode(file))]
+    return np.lexsort(rows[1].T)[np.argsort(np.lexsort(rows[0].T))]
+
+
 #: Contents that the help and the guide call `header`.
 HEADER = {"coordinate_system", "origin", "unit_metres", "metadata", "antialiased", "flat", "colour_space"}
 

@@ -174,7 +174,7 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
             origin=(x, y, z),
             means_double=doubles,
             metadata=replace(model.metadata.with_entries(view=None), cameras=None),
-            extra=_map_extra(model, stretch, np.linalg.inv(stretch).T),
+            extra=_map_extra(model, stretch, (left / lengths) @ left.T),
         )
 
 
