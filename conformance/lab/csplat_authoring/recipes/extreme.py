@@ -64,6 +64,14 @@ def _codebooks() -> list[Recipe]:
     rows = [[*range(-13, 14)]] * (n - 1) + [[*range(27)]]
     bands = Codebook(1, _spec.CODEBOOK_KIND_SH, {4: rows}, (4, 4), Stream(1, _RUNS))
     last_band = codebook_block(1, (n - 1, n, 0), signed([[*range(99, 126)]]), Stream(3))
+    thirds = [[*range(9)]] * 256 + [[*range(20, 29)]] * (2**15 - 256) + [[*range(40, 49)]] * (2**15 - 1)
+    common = Codebook(1, _spec.CODEBOOK_KIND_SH, {1: thirds}, (1, 1), Stream(1, _RUNS))
+    two_bytes = codebook_block(1, (255, 256, 2**15, 2**16 - 1), signed([[*range(60, 69)]]), Stream(2))
+    full, runs = _spec.TILE_SPLATS_MAX, Stream(1, _RUNS)
+    escaped = codebook_block(1, (1,) * full, signed([[*range(9)]] * full, runs), runs)
+    same = tile(2, 1, 1)
+    every_one = {name: replace(block, rows=[list(block.rows[0])] * full) for name, block in same.blocks.items()}
+    all_of_65536 = replace(same, blocks=every_one | {sh_attribute(1): escaped})
     unused = (
         Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6]]}),
         Codebook(2, _spec.CODEBOOK_KIND_SH, {1: rows_of(1, 2, 9, -1, 1)}, (1, 1)),
@@ -106,6 +114,21 @@ def _codebooks() -> list[Recipe]:
             "65,536 entries of 27 columns, and an escaped splat",
             "CBR-4 CBK-2 CBK-3",
             scene(4, [tile(2, 3, 3, {sh_attribute(4): last_band})], codebooks=(bands,)),
+        ),
+        _extreme(
+            "codebook_index_of_two_bytes",
+            "indices on both sides of 2^8 and 2^15, and the escape index 65,535",
+            "CBK-2 CBK-3",
+            scene(1, [tile(2, 4, 1, {sh_attribute(1): two_bytes})], codebooks=(common,)),
+        ),
+        _extreme(
+            "codebook_escapes_of_65536",
+            "65,536 escaped splats, whose number needs 17 bits",
+            "CBK-3",
+            with_stream_codings(
+                scene(1, [all_of_65536], codebooks=(Codebook(1, _spec.CODEBOOK_KIND_SH, {1: [[0] * 9]}, (1, 1)),)),
+                lambda coding: replace(coding, transforms=_RUNS),
+            ),
         ),
         _extreme(
             "codebooks_unused",

@@ -42,6 +42,16 @@ def valid_level_recipes() -> list[Recipe]:
             "RSL-1 RSL-2",
             scene(tiles=[one], extras=extras),
         ),
+        valid_recipe(
+            "extreme",
+            "resource_level_of_ancillary_column",
+            "a full tile of level A, which a wide column of a type from 128 on does not raise",
+            "RSL-1 RSL-2 ANC-3",
+            scene(
+                tiles=[_tile_of(_FULL, [Block(_spec.CODING_RAW, [[0]] * _FULL, _equal(0, _FULL))])],
+                extras=(Extra("later", _spec.ANCILLARY_ID_MIN + 2, _spec.EXTRA_COMPONENTS_MAX),),
+            ),
+        ),
     ]
 
 
