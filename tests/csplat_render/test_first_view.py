@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cameras_cases import ball, figure, niche
+from cameras_cases import ball, figure, niche, on_a_sphere
 from checked import cloud
 from models import with_facts
+from tables import failures
 
 import csplat
 from csplat.errors import InputError
 from csplat_render.camera import Camera, intrinsics, look_at
+from csplat_render.camera_paths import orbit_cameras
 from csplat_render.first_view import SAMPLE_SPLATS, viewing_metadata
 from csplat_render.scene_frame import scene_frame
 
@@ -45,6 +47,38 @@ def test_an_object_is_shown_whole_despite_floaters():
     assert camera.W == camera.H
     assert ((places > 0) & (places < camera.W)).all()
     assert np.abs(2 * places / camera.W - 1).max() > 0.8
+
+
+def test_far_splats_do_not_draw_the_first_view_away_from_the_scene():
+    clean, rng = ball(), np.random.default_rng(3)
+    dome = on_a_sphere(rng, 1400)
+    away = on_a_sphere(rng, 75) * 10.0 ** rng.uniform(1.0, 6.0, (75, 1))
+    clump = [1.0, 2.0, 0.5] + 0.01 * rng.standard_normal((450, 3))
+    cases = {
+        f"{name}, {distance:g} radii": (distance * np.asarray(places), distance * size, alpha)
+        for distance in (10.0, 100.0, 1e4, 1e6)
+        for name, places, size, alpha in (
+            ("a faint blob", [[0.6, 0.8, 0.0]], 0.02, 0.3),
+            ("an opaque blob", [[0.6, 0.8, 0.0]], 0.3, 1.0),
+            ("eight blobs", on_a_sphere(rng, 8), 0.05, 0.5),
+            ("a clump of 23 %", clump, 0.002, 1.0),
+            ("a dome of 48 %", dome, 0.05, 1.0),
+        )
+    } | {"outliers, 5 %": (away, 0.03, 0.6)}
+
+    def check(case):
+        places, size, alpha = case
+        means, sizes = np.concatenate([clean.means, places]), np.repeat([0.03, size], [len(clean), len(places)])
+        alphas = np.repeat(np.float32([0.2, alpha]), [len(clean), len(places)])
+        model = cloud(means, sizes, opacities=alphas)
+        views = [first_view(model)[0], orbit_cameras(model, 3)[1]]
+        shown = [places_in(camera, clean.means) / [camera.W, camera.H] for camera in views]
+        inside = [((one > 0.0) & (one < 1.0)).all(axis=1).mean() for one in shown]
+        kind = scene_frame(model).kind
+        assert min(inside) > (0.98 if kind == "object" else 0.4), (kind, inside)  # surroundings: from near the middle
+        assert all(0.3 < float(np.median(np.abs(one - np.median(one, axis=0)))) * 8.0 for one in shown)
+
+    assert [] == failures(cases, check)
 
 
 def test_known_axes_name_the_front():

@@ -21,7 +21,7 @@ from csplat.model import SplatModel
 from csplat.scene_metadata import ESTIMATE, VIEW
 from csplat.types import F64, Mask
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
-from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, viewing_frame
+from csplat_render.scene_frame import Cloud, SceneFrame, detail, object_body, sample_cloud, viewing_frame
 from csplat_render.up_estimate import with_estimated_up
 from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING
 
@@ -89,7 +89,7 @@ def orbit_cameras(
         return orbit(frame.centre, 1.0, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     rng = np.random.default_rng(0)
     if frame.kind == "object":
-        body = main_parts(sample_cloud(model, _POINTS, rng), frame)
+        body = main_parts(sample_cloud(object_body(model, frame), _POINTS, rng), frame)
         centre, distance = orbit_framing(body, frame, elevation, K, width, height)
         return orbit(centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     cloud = sample_cloud(model, _ARC_POINTS, rng)

@@ -21,7 +21,7 @@ from csplat.scene_metadata import ESTIMATE, TRAINED, UNSPECIFIED, VIEW, SceneMet
 from csplat.types import F64
 from csplat_render.camera import Camera, central_camera, direction_at, intrinsics, look_at
 from csplat_render.camera_paths import ELEVATION, main_parts, orbit_framing
-from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, viewing_frame
+from csplat_render.scene_frame import Cloud, SceneFrame, detail, object_body, sample_cloud, viewing_frame
 from csplat_render.up_estimate import POINTS_PER_SPLAT, estimate_up
 from csplat_render.virtual_cameras import HIDING
 
@@ -76,7 +76,8 @@ def viewing_metadata(model: SplatModel, cameras: Sequence[Camera] = (), *, every
     known = [] if frame.kind == "object" else cameras or _cameras_of(metadata)
     if known:
         return metadata.with_entries(view=view_entry(central_camera(known), TRAINED))
-    cloud = sample_cloud(model, min(_POINTS, POINTS_PER_SPLAT * len(model)), np.random.default_rng(0), every)
+    body = object_body(model, frame)
+    cloud = sample_cloud(body, min(_POINTS, POINTS_PER_SPLAT * len(body)), np.random.default_rng(0), every)
     try:
         return metadata.with_entries(view=view_entry(_estimate(metadata, cloud, frame), ESTIMATE))
     except InputError:

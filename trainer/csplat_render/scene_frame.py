@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from csplat.model import SplatModel
-from csplat.types import F64, I64
+from csplat.types import F64, I64, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, direction_at, look_at
 
 #: Splats of lower opacity are never drawn.
@@ -26,9 +26,15 @@ MIN_OPACITY = 1.0 / 255.0
 _MAX_LOG_SCALE = 60.0  # fourth powers of larger scales overflow
 _NEAR = 0.05  # near plane, extents; at most DEFAULT_NEAR
 _FAR_REACH = 4.0  # radius of an object, in radii of the sphere that contains half the opacity
-_FAR_SHARE = 0.02  # fraction of the surface; if more is outside this radius, the scene is surroundings
+_FAR_SHARE = 0.02  # fraction of the surface; if more is outside this radius, the scene is surroundings,
+_FAR_OPACITY = 0.004  # and if this fraction of the opacity is outside, too: 0.9 % at least in captures of surroundings
 _BOX_QUANTILES = (0.05, 0.5, 0.95)  # quantiles of opacity along an axis: the box's ends and its middle
 _AREA_REACH = 0.5  # side of the largest area of a splat that counts, in radii that contain half the opacity
+_OBJECT_REACH = 2.5  # extents from the middle of an object; captures reach 2.0, splats farther away are floaters
+_CORE_SHARE = 0.25  # minimum fraction of the visible splats in the core of a scene
+_CORE_GAP = 2.0  # ratio of the outer to the inner radius of the gap around a core
+_GAP_SHARE = 0.01  # maximum fraction of the visible splats in that gap
+_CORE_REACH = 8.0  # radii of a quarter of the splats; at most 4 in captures, whose frames are left as they are
 _SINGLE_EXTENT = 3.0  # extent of splats at a single position, in standard deviations of the largest
 _USUAL_UP = (0.0, -1.0, 0.0)  # what viewers assume of scenes of unknown axes
 _FLAT = 0.6  # ratio of the shortest extent to the next; if it is smaller, the short axis points up
@@ -84,9 +90,32 @@ class SceneFrame:
 
 
 def scene_frame(model: SplatModel) -> SceneFrame:
-    """Compute the frame of a scene. A scene without splats is an object of extent 1 at the origin."""
+    """Compute the frame of a scene. A scene without splats is an object of extent 1 at the origin.
+
+    If far splats hold most of the opacity, such as a dome of the sky, it is the frame of the scene's core.
+    """
     if len(model) == 0:
         return SceneFrame("object", np.zeros(3), 1.0, np.array([0.0, -1.0, 0.0]))
+    frame = _opacity_frame(model)
+    core = _dense_core(model, frame)
+    return frame if core.all() else _opacity_frame(model.select(core))
+
+
+def object_body(model: SplatModel, frame: SceneFrame) -> SplatModel:
+    """Return the splats of an object, without those far away: they are large if seen, and would outweigh it.
+
+    Args:
+        model: the scene.
+        frame: its frame; surroundings have no end, and are returned as they are.
+    """
+    if frame.kind != "object":
+        return model
+    near = np.sum((model.means.astype(np.float64) - frame.centre) ** 2, axis=1) <= (_OBJECT_REACH * frame.extent) ** 2
+    return model if near.all() or not near.any() else model.select(near)
+
+
+def _opacity_frame(model: SplatModel) -> SceneFrame:
+    """Compute the frame of at least one splat by quantiles of opacity."""
     alpha, areas = visible_opacity(model), surface_areas(model)
     means = model.means.astype(np.float64)
     low, middle, high = np.stack([weighted_quantiles(means[:, k], alpha, _BOX_QUANTILES) for k in range(3)], axis=1)
@@ -95,12 +124,37 @@ def scene_frame(model: SplatModel) -> SceneFrame:
     distances = np.sqrt(np.sum((means - middle) ** 2, axis=1))
     reach = float(weighted_quantiles(distances, alpha, (0.5,))[0])
     surface = alpha * np.minimum(areas, (_AREA_REACH * reach) ** 2)  # limited so that no floater outweighs a scene
-    if np.sum(surface[distances > _FAR_REACH * reach]) > _FAR_SHARE * np.sum(surface):
+    far = distances > _FAR_REACH * reach
+    if np.sum(surface[far]) > _FAR_SHARE * np.sum(surface) and np.sum(alpha[far]) > _FAR_OPACITY * np.sum(alpha):
         return SceneFrame("surrounding", middle, reach, up)
     extent = float(np.sqrt(np.sum(half**2)))
     if extent <= 0.0:  # a single position
         extent = _SINGLE_EXTENT * float(np.sqrt(np.max(areas[alpha > 0.0]) / (2.0 * np.pi)))
     return SceneFrame("object", (low + high) / 2.0, extent, up)
+
+
+def _dense_core(model: SplatModel, frame: SceneFrame) -> Mask:
+    """Return the splats of a scene's core, [N] bool; all, if the frame fits them or nothing separates a core.
+
+    The core has a gap around it, in which there are hardly any splats. Splats are counted, not weighed: those of a
+    background are few, but large and opaque.
+    """
+    means = model.means.astype(np.float64)
+    visible = model.opacities >= MIN_OPACITY
+    everything: Mask = np.ones(len(model), np.bool_)
+    if not visible.any():
+        return everything
+    middle = np.median(means[visible], axis=0)
+    distances = np.sqrt(np.sum((means - middle) ** 2, axis=1))
+    away = np.sort(distances[visible & (distances > 0.0)])  # many may be in one place
+    first = int(_CORE_SHARE * len(away))
+    shift = float(np.sqrt(np.sum((frame.centre - middle) ** 2)))
+    if len(away) == 0 or max(frame.extent, shift) <= _CORE_REACH * away[first]:
+        return everything
+    beyond = np.searchsorted(away, _CORE_GAP * away[first:], side="right") - np.arange(first + 1, len(away) + 1)
+    radius = away[first + int(np.argmax(beyond <= _GAP_SHARE * len(away)))]
+    core: Mask = distances <= radius
+    return core
 
 
 def viewing_frame(model: SplatModel) -> SceneFrame:

@@ -14,7 +14,7 @@ import numpy as np
 from csplat.model import SplatModel
 from csplat.scene_metadata import Direction
 from csplat_render.camera import intrinsics, look_at
-from csplat_render.scene_frame import detail, sample_cloud, scene_frame
+from csplat_render.scene_frame import detail, object_body, sample_cloud, scene_frame
 from csplat_render.virtual_cameras import FIELD_OF_VIEW
 
 #: Cloud points for each splat of a small scene; more show no more of it.
@@ -44,7 +44,8 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
     frame = scene_frame(model)
     if frame.kind != "object":
         return None
-    cloud = sample_cloud(model, min(_UP_POINTS, POINTS_PER_SPLAT * len(model)), np.random.default_rng(0), every)
+    body = object_body(model, frame)
+    cloud = sample_cloud(body, min(_UP_POINTS, POINTS_PER_SPLAT * len(body)), np.random.default_rng(0), every)
     K = intrinsics(_UP_IMAGE_SIZE, _UP_IMAGE_SIZE, FIELD_OF_VIEW)
     heights = 1.0 - (2.0 * np.arange(_UP_DIRECTIONS) + 1.0) / _UP_DIRECTIONS  # spiral that covers the sphere evenly
     turns, radii = np.pi * (1.0 + 5.0**0.5) * np.arange(_UP_DIRECTIONS), np.sqrt(1.0 - heights**2)

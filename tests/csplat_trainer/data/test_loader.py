@@ -19,6 +19,7 @@ from tables import failures
 from csplat.errors import InputError
 from csplat_render.camera import relative_to
 from csplat_trainer.data import load
+from csplat_trainer.data.loader import point_outliers
 from csplat_trainer.initial_splats import measure_extent
 
 colmap_text = partial(sets.write_colmap_set, text=True)
@@ -382,6 +383,43 @@ def test_outlier_cameras_are_reported_and_ignored_and_refused_beyond_float32(col
     shots[3] = relative_to((1e39, 0.0, 0.0), cameras(9)[3])
     sets.write_colmap(colmap_set / "sparse" / "0", shots)
     assert_refused(r"camera of im 003.png is .* units from 0", colmap_set)
+
+
+def test_outlier_points_are_reported_and_left_out(tmp_path):
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((1000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    near, none = directions * rng.random((1000, 1)) ** (1 / 3), directions[:0]
+    background = directions[:100] * 10.0 ** np.linspace(0.0, 1.5, 100)[:, None]
+    cases = {
+        **{
+            f"{count} at {distance:g} radii": (near, directions[:count] * distance)
+            for count in (1, 10, 50)
+            for distance in (10.0, 1e3, 1e6, 1e300)
+        },
+        "50 at 10 to a million radii": (near, directions[:50] * 10.0 ** np.linspace(1.0, 6.0, 50)[:, None]),
+        "a background that thins out": (np.concatenate([near, background]), none),
+        "a dome": (np.concatenate([near, directions[:300] * 60.0]), none),
+        "one place": (np.concatenate([np.zeros((40, 3)), np.ones((2, 3))]), none),
+        "no points": (none, none),
+    }
+
+    def check(case):
+        expected = np.repeat([False, True], [len(part) for part in case])
+        assert np.array_equal(expected, point_outliers(np.concatenate(case)))
+
+    assert [] == failures(cases, check)
+    place = colmap_text(tmp_path)
+    file = place / "sparse" / "0" / "points3D.txt"
+    rows = [f"{i} {' '.join(map(str, point))} 1 2 3 0.5 1 0 2 0\n" for i, point in enumerate(near.tolist())]
+    file.write_text("".join(rows))
+    clean = load(place)
+    file.write_text("".join([*(f"{i} 5000 {i} 7 9 9 9 0.5 1 0 2 0\n" for i in range(10)), *rows]))
+    data = load(place)
+    assert np.array_equal(clean.points, data.points)
+    assert np.array_equal(clean.points_rgb, data.points_rgb)
+    assert not any("left out" in line for line in clean.report)
+    assert [line for line in data.report if line.startswith("10 of 1,010 points are at least 5,000 units")]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import numpy as np
 
 from csplat.errors import InputError, counted
 from csplat.scene_metadata import UNSPECIFIED, Direction, unit_up, up_of_axes
-from csplat.types import F64
+from csplat.types import F64, Mask
 from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Shot, UnreadDataSet, near_plane, open_shot
@@ -75,6 +75,7 @@ def load(
     unread = _read_by_kind(place, path, size, images, test_every)
     if not unread.train:
         raise InputError(f"{path} has no training images")
+    unread = _drop_far_points(unread)
     doubts = describe_poses([*unread.train, *unread.test], unread.points)
     unread, origin = choose_origin(unread)
     unread = _resolve_links(unread, place)
@@ -304,6 +305,55 @@ def choose_origin(data: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
     words = " ".join(str(value).removesuffix(".0") for value in (x, y, z))
     report = f"coordinates are far from 0: the scene is relative to the origin {words}"
     return replace(data, train=train, test=test, val=val, points=points, report=[*data.report, report]), (x, y, z)
+
+
+_FAR_POINT = 8.0  # least distance of an outlier from the middle of the points, in median distances
+_POINT_GAP = 2.0  # least distance of an outlier, in largest distances of the other points; or else
+_FARTHEST_POINT = 100.0  # largest distance of others, in median distances; beyond, cameras see hardly any parallax
+_MOST_FAR_POINTS = 0.1  # maximum fraction of outliers
+
+
+def point_outliers(points: F64) -> Mask:
+    """Find points that are far away from all others, as structure from motion places points seen at small angles.
+
+    Distances that grow gradually, as in the background of a scene, are no outliers up to `_FARTHEST_POINT`.
+
+    Args:
+        points: [P, 3].
+
+    Returns:
+        [P], True for outliers, at most a tenth of all.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.bool_)
+    with np.errstate(over="ignore"):  # squares may overflow to infinity
+        distances = np.sqrt(np.sum((points - np.median(points, axis=0)) ** 2, axis=1))
+    away = np.sort(distances)
+    first, usual = max(1, math.ceil((1.0 - _MOST_FAR_POINTS) * len(away))), away[len(away) // 2]
+    least = np.maximum(_FAR_POINT * usual, np.minimum(_POINT_GAP * away[first - 1 : -1], _FARTHEST_POINT * usual))
+    far = away[first:] > least
+    if usual == 0.0 or away[first - 1] > _FARTHEST_POINT * usual or not far.any():
+        return np.zeros(len(points), np.bool_)
+    outliers: Mask = distances >= away[first + int(np.argmax(far))]
+    return outliers
+
+
+def _drop_far_points(data: UnreadDataSet) -> UnreadDataSet:
+    """Drop outliers among a set's points, and report them: splats that start there are not seen, but stay."""
+    if data.points is None:
+        return data
+    outliers = point_outliers(data.points)
+    if not outliers.any():
+        return data
+    distances = np.linalg.norm(data.points - np.median(data.points, axis=0), axis=1)
+    nearest, usual = float(distances[outliers].min()), float(np.median(distances[~outliers]))
+    count = int(np.count_nonzero(outliers))
+    report = (
+        f"{count:,} of {counted(len(outliers), 'point')} {'is' if count == 1 else 'are'} at least {nearest:,.4g} units"
+        f" from the middle of the others, {nearest / usual:,.4g} times the usual distance: left out"
+    )
+    colours = None if data.points_rgb is None else data.points_rgb[~outliers]
+    return replace(data, points=data.points[~outliers], points_rgb=colours, report=[*data.report, report])
 
 
 def describe_outliers(data: DataSet) -> str:
