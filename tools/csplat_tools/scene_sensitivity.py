@@ -85,6 +85,7 @@ def measure_scene(
     """
     if not len(model):
         raise InputError(_NOTHING)
+    views.require_fit()
     cameras, check, source = (
         views.training or views.test,
         list[Camera](),

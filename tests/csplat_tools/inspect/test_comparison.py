@@ -84,6 +84,23 @@ def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scen
     assert known.errors["means"] == pytest.approx(found.errors["means"])
 
 
+def test_splats_are_not_paired_by_an_order_that_differs_within_far_clusters(tmp_path):
+    rng = np.random.default_rng(2)
+    near = cloud(rng.standard_normal((600, 3)), 0.02, sh0=rng.standard_normal((600, 3)).astype(np.float32))
+    for count, distance in ((2, 1e3), (3, 100.0), (30, 1e4)):
+        place = np.arange(600) * count // 600
+        far = replace(near, means=(near.means + (distance * rng.standard_normal((count, 3)))[place]).astype(np.float32))
+        assert "order" == errors_of(far, far).pairing
+        inside = far.select(np.lexsort((rng.random(600), place)))
+        half = far.select(np.concatenate([np.arange(360), 360 + rng.permutation(240)]))
+        assert (None, None) == (errors_of(far, inside), errors_of(far, half))
+        path = tmp_path / f"{count}.csplat"
+        encode(far, out=path)
+        scene, errors = load_scene(str(path)), errors_of(far, str(path))
+        assert ("search", 600) == (errors.pairing, errors.matched)
+        assert all(errors.errors[one.measure][0] <= 1.001 * one.max for one in scene.declared_bounds.records)
+
+
 def test_a_scene_compared_with_itself_scores_99_wherever_its_origin(scene, cameras):
     compared = compare_models(scene, scene, cameras)
     assert (99.0, 99.0, 99.0, None) == (compared.psnr, compared.psnr_mean, compared.psnr_worst, compared.lpips)

@@ -99,7 +99,7 @@ def compare(
         for name, scene in ((a, source), (b, other)):
             out.print_findings(findings_of(scene), Path(name).name)
         model, every = sample_scene(source, progress=progress)
-        view_set = views.find(model, out, count=0, split=split, every=every)
+        view_set = views.find(model, out, a, count=0, split=split, every=every, must_fit=False)
         if mode == "exact":
             from csplat_tools.views.view_sets import total_render_seconds
 

@@ -160,7 +160,7 @@ def encode(
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                view_set = _find_views(scene.model(), options, target, views, level_count, out, context)
+                view_set = _find_views(source, scene.model(), options, target, views, level_count, out, context)
         try:
             encoded = encode_file(
                 scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
@@ -209,6 +209,7 @@ def _publish_estimate(
 
 
 def _find_views(
+    source: str,
     model: SplatModel,
     options: EncodeOptions,
     target: Target,
@@ -221,7 +222,7 @@ def _find_views(
     from csplat_tools.optimise.target_encoding import expected_search_seconds
 
     context.progress("placing views", 0.0)
-    view_set = views.find(model, out)
+    view_set = views.find(model, out, source)
     if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
         out.announce_time(

@@ -97,7 +97,9 @@ def finetune(
         out.print_findings(scene.findings)
         model = scene.model()
         validation_count = tuning.default_validation_count(tuning.VIEWS, cameras=cameras, data=data)
-        view_set = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=validation_count)
+        view_set = views.find(
+            model, out, source, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=validation_count
+        )
         view_set.read_images()
         result = tuning.run_finetuning(
             with_first_view(scene).model(), view_set, output, encoding, options, Outputs(path, resume=resume),

@@ -54,7 +54,7 @@ def sensitivity(
         out.print_findings(read.findings)
         model = read.model()
         view_set = views.find(
-            model, out, count=None if cameras is None else 0, validation_count=None if data is None else 0
+            model, out, source, count=None if cameras is None else 0, validation_count=None if data is None else 0
         )
         out.announce_time(
             lambda: _PASSES * total_render_seconds(model, view_set.training or view_set.test),

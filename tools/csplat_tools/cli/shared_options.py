@@ -272,19 +272,23 @@ class ViewOptions:
         self,
         model: SplatModel,
         output: Output,
+        path: str,
         *,
         count: int | None = None,
         size: tuple[int, int] | None = None,
         validation_count: int | None = None,
         split: Split = "test",
         every: int = 1,
+        must_fit: bool = True,
     ) -> ViewSet:
         """Find views of a scene, and print remarks about them.
 
         Args:
             model: the scene.
             output: prints remarks.
+            path: the scene's file.
             count, size, validation_count, split, every: as for `find_view_set`.
+            must_fit: refuse a data set that the scene does not fit, instead of a remark.
 
         Returns:
             The views by role; virtual views if there is neither a camera file nor a data set.
@@ -295,9 +299,11 @@ class ViewOptions:
         """
         view_set = find_view_set(
             model, cameras=self.cameras, data=self.data_options, background=self.colour, count=count, size=size,
-            validation_count=validation_count, split=split, every=every,
+            validation_count=validation_count, split=split, every=every, path=path,
         )  # fmt: skip
-        output.remark(*view_set.notes)
+        output.remark(*(note for note in view_set.notes if not (must_fit and note == view_set.misfit)))
+        if must_fit:
+            view_set.require_fit()
         axis = None if output.quiet or view_set.name != VIRTUAL else estimate_up(model, every)
         if axis is not None:
             output.remark(

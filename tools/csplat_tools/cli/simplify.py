@@ -66,7 +66,7 @@ def simplify(
         out.print_findings(read.findings)
         model = overrides.apply_to_model(read.model())
         progress("placing views", 0.0)
-        view_set = views.find(model, out)
+        view_set = views.find(model, out, source)
         plan = simplify_plan(options.pruner(model, view_set), target)
         out.announce_time(lambda: plan_seconds(plan, model, view_set), "--effort 1 takes less")
         progress("placing views", 1.0)

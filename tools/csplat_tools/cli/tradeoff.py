@@ -64,7 +64,7 @@ def tradeoff(
     with out.bar() as progress:
         read, context = read_source(source), Context(progress=progress)
         out.print_findings(read.findings)
-        view_set = views.find(read.model(), out)
+        view_set = views.find(read.model(), out, source, must_fit=bool(searches))
         if len(read.model()):
             out.announce_time(
                 lambda: sum(

@@ -37,6 +37,7 @@ from csplat_render.gpu.renderer import GpuScene
 from csplat_render.gpu.scoring import compare_scenes
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_render.neighbours import nearest_neighbours
 from csplat_render.scorer import OnView, Renderable, Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import check_output, write_text
@@ -48,7 +49,8 @@ from csplat_tools.views import VIRTUAL, Colour, DataOptions, ViewSet, find_view_
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
-_NEAR = 0.01  # fraction of the scene's spread; largest median distance of splats in the same order
+_PAIRED = 0.95  # least fraction of splats in the same order that are nearer to their partner than to other splats
+_NEAR, _SAME_PLACE = 0.01, 1e-5  # fractions of the scene's spread; limits of that distance: splats may coincide
 #: Name that searches LPIPS weights in the usual places, instead of a file.
 AUTO_WEIGHTS = "auto"
 _SHOWN = 8  # views of a page, which has a quarter of a megabyte for each
@@ -366,17 +368,21 @@ def _errors(source: Source, other: SplatModel, index: NDArray[Any], context: Con
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
-    """Return True if both scenes seem to have the same order; in a shuffled scene half of the pairs are far apart.
+    """Return True if both scenes seem to have the same order: almost all pairs are nearer than the next splat is.
 
     Return False for scenes of different numbers of splats, and without splats.
     """
     if len(source) != len(other) or not len(source):
         return False
-    means = source.means.astype(np.float64)
-    shift = np.subtract(other.origin, source.origin)
-    distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
+    means, theirs = source.means.astype(np.float64), other.means.astype(np.float64)
+    finite = np.isfinite(means).all(axis=1) & np.isfinite(theirs).all(axis=1)
+    means, theirs = means[finite], theirs[finite] + np.subtract(other.origin, source.origin)
+    if not len(means):
+        return False
+    distances = np.linalg.norm(theirs - means, axis=1)
     spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
-    return float(np.median(distances)) <= _NEAR * spread
+    spacings = np.clip(nearest_neighbours(means, 1)[1][:, 0], _SAME_PLACE * spread, _NEAR * spread)
+    return float(np.mean(distances <= spacings)) >= _PAIRED
 
 
 def _views(

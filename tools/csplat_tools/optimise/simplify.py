@@ -28,7 +28,7 @@ from csplat_tools.optimise.search_plan import SCORES, simplify_plan
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.scene_files import SceneLike, load_scene
-from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
+from csplat_tools.views import VIEW_SIZE, VIRTUAL, ViewSet, default_views, find_view_set, require_visible
 
 _TRIES = 4  # largest number of refits that correct the number of splats for a PSNR
 _NOT_PRUNED = "no pruned scene reached the target: all splats are kept, unchanged"
@@ -154,6 +154,9 @@ def simplify(
     if views is None:
         count, size = options.views_and_size(len(source))
         views = find_view_set(source, background=options.background, count=count, size=size, seed=context.seed)
+    views.require_fit()
+    if views.name != VIRTUAL and views.test:
+        require_visible(views, views.test_scorer(source, context=context))
     plan = simplify_plan(options.pruner(source, views), target)
     progress = PlannedProgress("search", plan, context.progress)
     context = replace(context, progress=progress)

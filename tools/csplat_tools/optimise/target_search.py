@@ -74,7 +74,14 @@ from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.planned_progress import PlannedProgress
 from csplat_tools.scene_sensitivity import MANY_SPLATS
-from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, views_off_path, with_validation_views
+from csplat_tools.views import (
+    VIRTUAL,
+    ViewSet,
+    extra_test_cameras,
+    require_visible,
+    views_off_path,
+    with_validation_views,
+)
 
 # Typical values.
 _USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
@@ -747,13 +754,13 @@ def search_target(
         SearchInterrupted: the search was interrupted, and no file so far meets the target. If one does, the best is
             returned, and `interrupted` is set in the report.
     """
+    views.require_fit()
     views = with_validation_views(views)
     plan = search_plan(options.pruner(source, views), target, encoding, has_levels=levels is not None)
     progress = PlannedProgress("search", plan, context.progress)
     context = replace(context, progress=progress)
     test_scorer = views.test_scorer(source, context=context)
-    if views.name != VIRTUAL and _is_empty(test_scorer):
-        raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
+    require_visible(views, test_scorer)
     if target.max_psnr_drop is not None and not views.images:
         raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
@@ -816,12 +823,6 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions) ->
         raise InputError("a scene without splats cannot be encoded to a target")
     if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:
         raise InputError("attribute_psnr is chosen by the target: give only one of them")
-
-
-def _is_empty(scorer: Scorer) -> bool:
-    """Return True if every test image has a single colour."""
-    images = (scorer.reference(number).rgb for number in range(len(scorer.cameras)))
-    return all(np.ptp(image, axis=(0, 1)).max() == 0.0 for image in images)
 
 
 def _psnr_elsewhere(source: SplatModel, chosen: Candidate, views: ViewSet, context: Context) -> dict[str, float]:

@@ -84,7 +84,7 @@ def find_cameras(
     elif data is not None:
         # An orbit uses the positions of the cameras, but not the size of their images: `size` is the orbit's.
         data_set = data if orbit_count is None else replace(data, size=None)
-        views = find_view_set(model, data=data_set, count=0, split=split)
+        views = find_view_set(model, data=data_set, count=0, split=split, check_fit=False)
         cameras = [*views.test, *(() if orbit_count is None else (*views.training, *views.validation))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} views")

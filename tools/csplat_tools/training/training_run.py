@@ -78,7 +78,7 @@ def run_training(
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
-        views = find_view_set(model, data=data_set, validation_count=0)
+        views = find_view_set(model, data=data_set, validation_count=0, check_fit=False)
         shown = show_views(model, {"trained scene": model}, views, context)
         write_training_page(page, output, result.log, None, shown)
     if not quiet:
@@ -129,7 +129,9 @@ def run_training_to_file(
         _ = image.pixels, image.mask
     result = _train(data_set, options, files, plot=plot, expected=expected, context=context, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
-    views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
+    views = find_view_set(
+        model, data=data_set, validation_count=0, check_fit=False
+    )  # the tuning splits the training views
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}

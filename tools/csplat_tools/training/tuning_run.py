@@ -558,6 +558,7 @@ def choose_and_finetune(
     if target is not None:
         target.require("finetune", "psnr", "size", "keep")
         check_target(source, target, encoding)
+    views.require_fit()
     tuner = Tuner(
         source, views, encoding, options,
         Outputs() if files is None or (target is not None and target.psnr is not None) else files,

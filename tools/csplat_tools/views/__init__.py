@@ -17,6 +17,7 @@ from csplat_tools.views.view_sets import (
     describe_views,
     display_cameras,
     find_view_set,
+    require_visible,
     with_validation_views,
 )
 from csplat_tools.views.virtual_views import (
@@ -54,6 +55,7 @@ __all__ = [
     "evenly_spaced",
     "extra_test_cameras",
     "find_view_set",
+    "require_visible",
     "shrink_cameras",
     "views_off_path",
     "with_validation_views",

@@ -36,6 +36,7 @@ from csplat_render.up_estimate import with_estimated_up
 from csplat_render.virtual_cameras import HIDING, farthest_points, virtual_cameras
 from csplat_tools.optional_packages import require_data_sets
 from csplat_tools.views import virtual_views
+from csplat_tools.views.set_fit import NORMALISATION, measure_fit, normalised_images
 from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, default_views, evenly_spaced
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ class ViewSet:
         origin: the scene's origin, to which all cameras are relative.
         notes: remarks for the user on the choice of views, a line each.
         split: part of the data set that the test views are.
+        misfit: why the scene does not fit the images, a sentence that is among the notes, too; empty if it fits.
 
     Raises:
         InputError: a view has two roles.
@@ -101,6 +103,7 @@ class ViewSet:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
     split: Split = "test"
+    misfit: str = ""
 
     def __post_init__(self) -> None:
         """Refuse views of one pose in several roles.
@@ -166,6 +169,15 @@ class ViewSet:
         """
         return self._image_scorer(self.validation, "standard", context)
 
+    def require_fit(self) -> None:
+        """Refuse to prune, tune or weigh splats by images that the scene does not show.
+
+        Raises:
+            InputError: the scene does not fit the images.
+        """
+        if self.misfit:
+            raise InputError(self.misfit)
+
     def images_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the images of the given cameras, in their order."""
         taken = {id(image.camera): image for image in self.images}
@@ -192,6 +204,21 @@ class ViewSet:
             raise InputError("the views have no images: name a data set")
         shown = self.images_of(cameras)
         return image_scorer(shown, self.background, mode=mode, context=context, origin=self.origin)
+
+
+def require_visible(views: ViewSet, scorer: Scorer) -> None:
+    """Refuse given views in which the scene cannot be seen, so that every file would have a perfect score.
+
+    Args:
+        views: the views.
+        scorer: scorer on some of them, against the source's renders.
+
+    Raises:
+        InputError: every render has a single colour.
+    """
+    renders = (scorer.reference(number).rgb for number in range(len(scorer.cameras)))
+    if views.name != VIRTUAL and all(np.ptp(render, axis=(0, 1)).max() == 0.0 for render in renders):
+        raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
 
 
 def describe_views(count: int, name: str) -> str:
@@ -244,6 +271,8 @@ def find_view_set(
     validation_count: int | None = None,
     split: Split = "test",
     every: int = 1,
+    path: str | None = None,
+    check_fit: bool = True,
 ) -> ViewSet:
     """Read or place views, and assign each a role; see the table at the head of the module.
 
@@ -259,6 +288,10 @@ def find_view_set(
         validation_count: number of validation views; `None`: as in the table; 0: keep all others as training views.
         split: the part of a data set that becomes test views. With `train`, there are no other views.
         every: the source is every Nth splat of the scene; used to place virtual test views.
+        path: the scene's file. A `dataparser_transforms.json` next to it, which nerfstudio writes, is used if the
+            scene fits the data set with it, and not without.
+        check_fit: find out if the scene fits the data set (`set_fit`), unless it is a part of the scene; False for a
+            scene that was trained on it just now.
 
     Raises:
         InputError: both `cameras` and `data` are given, or the given views are not valid, or too few.
@@ -271,7 +304,8 @@ def find_view_set(
     usual = default_views(every * len(source))
     count, size = usual[0] if count is None else count, size or usual[1]
     if data is not None:
-        return _views_of_data(source, data, background, validation_count, split)
+        checked_path = (path or "",) if check_fit and every == 1 and len(source) else ()
+        return _views_of_data(source, data, background, validation_count, split, *checked_path)
     if cameras is None:
         test = comparison_cameras(source, every)
         test_poses = {pose_key(camera) for camera in test}  # in an empty scene all views are equal
@@ -408,6 +442,7 @@ def _views_of_data(
     background: Colour | None,
     validation_count: int | None,
     split: Split,
+    checked_path: str | None = None,
 ) -> ViewSet:
     """Return the views of a data set, with cameras relative to the scene's origin.
 
@@ -421,6 +456,7 @@ def _views_of_data(
         background: background colour; `None`: as in the scene's metadata, or black.
         validation_count: number of validation views; `None`: as usual.
         split: `train` scores on the training images, instead of training on them.
+        checked_path: the scene's file, or an empty name, if it is to be checked that the scene fits; else `None`.
 
     Raises:
         InputError: the data set is invalid, or no view would be left for training.
@@ -429,10 +465,19 @@ def _views_of_data(
     name, data_set, notes = (
         _open_data_set(data, record) if isinstance(data, DataOptions) else (data.name, data, list[str]())
     )
-    shift = np.subtract(source.origin, data_set.origin)
     parts = (data_set.train, data_set.test, evenly_spaced(data_set.val, _VALIDATION_MAX))
-    train, test, val = (_shift_origin(part, shift) for part in parts)
     colour, colour_notes = _choose_background(background, record, images=True)
+    images = _shift_origin([image for part in parts for image in part], np.subtract(source.origin, data_set.origin))
+    misfit = ""
+    if checked_path is not None:
+        folder = data.path if isinstance(data, DataOptions) else ""
+        images, misfit, fit_note = _fitting_images(source, images, colour, name, checked_path, folder)
+        notes = [*notes, *fit_note]
+    train, test, val = (
+        images[: len(parts[0])],
+        images[len(parts[0]) :][: len(parts[1])],
+        images[len(images) - len(parts[2]) :],
+    )
     if split == "train":
         train, test, val = [], train, []
     pose_notes = list[str]()
@@ -448,8 +493,33 @@ def _views_of_data(
         validation, training = _split_validation(training, validation_count)
     return ViewSet(
         name, colour, training, validation, [image.camera for image in test], [*train, *val, *test],
-        origin=source.origin, notes=(*data_set.report, *notes, *colour_notes, *pose_notes), split=split,
+        origin=source.origin, notes=(*data_set.report, *notes, *colour_notes, *pose_notes), split=split, misfit=misfit,
     )  # fmt: skip
+
+
+def _fitting_images(
+    source: SplatModel, images: list[PosedImage], background: Colour, name: str, path: str, data: str
+) -> tuple[list[PosedImage], str, list[str]]:
+    """Return images in coordinates that the scene fits; else as they are, and why it does not fit; and remarks.
+
+    Args:
+        source: the scene.
+        images: the images of the set, at least one.
+        background: background colour.
+        name: name of the set.
+        path: the scene's file; empty: unknown.
+        data: path of the set.
+    """
+    fit = measure_fit(source, images, background)
+    if fit.fits:
+        return images, "", []
+    origin = np.array(source.origin)
+    for others in normalised_images(_shift_origin(images, -origin), path, data) if path else []:
+        moved = _shift_origin(others, origin)
+        if measure_fit(source, moved, background).fits:
+            return moved, "", [f"cameras are in the scene's coordinates by the {NORMALISATION} next to it"]
+    misfit = fit.describe(name)
+    return images, misfit, [misfit]
 
 
 def _open_data_set(data: DataOptions, record: TrainingRecord | None) -> tuple[str, DataSet, list[str]]:
