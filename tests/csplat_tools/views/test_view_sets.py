@@ -190,7 +190,7 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     )
     data.mkdir()
     data = photograph_object(shell(3), data) if kind == "blender" else as_colmap(photograph(shell(3), data))
-    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--size", "24x20", "--test-every", every)
+    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 150, "--size", "24x20", "--test-every", every)
     change_options(monkeypatch, "csplat_tools.cli.train.TrainOptions", init="box")
     change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")

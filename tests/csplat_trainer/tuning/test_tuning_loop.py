@@ -356,7 +356,7 @@ def test_a_refused_run_writes_and_replaces_nothing(capture, tmp_path, monkeypatc
         (1, "scene.ply old.csplat", "--self", "--force replaces it"),
         (1, "scene.ply a.csplat", "--self --checkpoint scene.ply --force", "is the input"),
         (1, "scene.ply a.csplat", "--data . --resume absent.npz", "absent.npz: No such file"),
-        (1, "one.ply a.csplat", f"--data {shlex.quote(str(capture))} --target-size 300B", "more than 300 (E_INPUT)"),
+        (1, "one.ply a.csplat", f"--data {shlex.quote(str(capture))} --target-size 300B", "does not fit capture"),
         (2, "scene.ply a.csplat", "", "expected --data or --self"),
         (2, "scene.ply a.csplat", "--self --data x", "--data and --self: give one of them"),
         (2, "scene.ply a.csplat", "--data x --cameras y", "--cameras and --data: give one of them"),
