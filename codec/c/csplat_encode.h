@@ -68,7 +68,8 @@ typedef struct csplat_ply {
 
 /* Read a PLY as trainers write it, binary of either byte order or text: columns x y z, rot_0..3, scale_0..2, opacity, f_dc_0..2 and
  * f_rest_0..., floats or doubles in any order (specification, E.1). Other columns and elements are left out. Comments of csplat
- * specify origin, axes, unit and how to render. E_INPUT: the file is no such PLY, or is damaged. */
+ * specify origin, axes, unit and how to render. Numbers of a text are the same in every locale, and rows are those that csplat.read
+ * accepts. E_INPUT: the file is no such PLY, or is damaged. */
 csplat_code csplat_read_ply(const void *data, size_t size, const csplat_encode_options *options, csplat_ply *out,
                             csplat_error *error);
 

@@ -46,7 +46,6 @@ const FIELDS = {
 const ARRAYS = /** @type {const} */ (['means', 'quats', 'scales', 'opacities', 'sh0', 'shN']);
 const WIDTHS = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3 };
 const COEFFICIENTS = [0, 3, 8, 15, 24]; // of bands 1 and above, by degree
-const NUMBER = /^[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|(inf(?:inity)?)|(nan))$/i;
 
 /** An error with a code of the specification: E_INPUT, the caller's data is invalid, or E_LIMIT, out of memory. */
 export class CsplatError extends Error {
@@ -83,14 +82,6 @@ class Instance {
       progress: (/** @type {number} */ done) => {
         onProgress?.(done);
         return signal?.aborted ? 0 : 1;
-      },
-      parse_number: (/** @type {number} */ at, /** @type {number} */ size, /** @type {number} */ value) => {
-        const match = NUMBER.exec(this.text(at, size));
-        if (match === null) return 0;
-        const magnitude = match[1] ? Infinity : match[2] ? NaN : null;
-        const number = magnitude === null ? Number(match[0]) : match[0][0] === '-' ? -magnitude : magnitude;
-        new DataView(this.exports.memory.buffer).setFloat64(value, number, true);
-        return 1;
       },
     };
     this.signal = signal;

@@ -402,7 +402,8 @@ BAD_TEXT = {
     "a value more": (LINES.replace("\n2.0 ", " 9.0\n"), ROWS, "row 1 of vertex has 27 values, expected 26"),
     "thousands separators": (f"{'1,000 ' * len(PLAIN)}\n" * 2, good_rows(2, PLAIN), "x is '1,000', expected a number"),
     "an integer beyond its type": (
-        "\n" + BIG_LABELS, np.zeros(2, [("label", "u1"), ("other", "u1"), *ROWS.dtype.descr]), r"a\.ply"),
+        "\n" + BIG_LABELS, np.zeros(2, [("label", "u1"), ("other", "u1"), *ROWS.dtype.descr]),
+        "line 35: row 1 of vertex has an integer beyond its type"),
 }  # fmt: skip
 
 

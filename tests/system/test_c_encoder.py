@@ -2,17 +2,25 @@
 """The encoder in C: it writes the integers of the preset `fast`, passes the encoder suite, and refuses bad input."""
 
 import ctypes
+import os
 import shlex
+import shutil
+import subprocess
+import sys
 import zlib
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
+import text_plys as texts
 from c_encoder import BUCKET_SPLATS, SAMPLE, C, compiled, run
+from tables import failures
 
 import csplat
+from csplat import InputError
 from csplat.decoder.decode_api import decode_integers, decode_scene
+from csplat.ply import read_ply
 from csplat.scene_metadata import SceneMetadata
 from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
 
@@ -279,6 +287,95 @@ def test_reads_what_comments_of_csplat_specify(tool, tmp_path, sample):
     assert few.origin == model.origin
     assert ("RUB", 2.0) == (model.metadata.coordinate_system, model.metadata.unit_metres)
     assert model.metadata.antialiased
+
+
+class Ply(ctypes.Structure):
+    _fields_: ClassVar = [("splats", Splats), ("row_count", ctypes.c_uint64), ("memory", ctypes.c_void_p)]
+
+
+class RefusedError(Exception):
+    """A PLY that the reader in C refuses."""
+
+
+def read_in_c(library, data):
+    """Return the arrays of a PLY by name, and its origin."""
+    ply, error, release = Ply(), Error(), ctypes.CDLL(None).free
+    release.argtypes = [ctypes.c_void_p]
+    if library.csplat_read_ply(data, ctypes.c_size_t(len(data)), None, ctypes.byref(ply), ctypes.byref(error)):
+        assert error.message.startswith(b"E_INPUT: ")
+        raise RefusedError(error.message.decode())
+    splats = ply.splats
+    widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3}
+    arrays = {
+        name: np.array(ctypes.cast(getattr(splats, name), ctypes.POINTER(ctypes.c_float))[: width * splats.count])
+        for name, width in widths.items()
+    }
+    arrays["positions"] = (
+        ctypes.cast(splats.positions, ctypes.POINTER(ctypes.c_double))[: 3 * splats.count] if splats.positions else None
+    )
+    origin = tuple(splats.origin)
+    release(ply.memory)
+    return arrays, origin
+
+
+def test_reads_the_texts_that_python_reads_and_names_the_same_lines(library):
+    def check(case):
+        data, place = case
+        if place is None:
+            model, (arrays, origin) = read_ply(data), read_in_c(library, data)
+            assert model.origin == origin
+            for name in ("means", "quats", "scales", "opacities", "sh0"):
+                assert np.array_equal(getattr(model, name).ravel(), arrays[name].astype(np.float32)), name
+            return
+        with pytest.raises(InputError, match=place):
+            read_ply(data)
+        with pytest.raises(RefusedError, match=place):
+            read_in_c(library, data)
+
+    def ply(word, extra):
+        return texts.text_ply(f"{texts.ROW} {word}\n{texts.ROW} 1\n", extra=f"property {extra} more\n")
+
+    place = f"line {texts.HEADER_LINES + 2}: row 0"
+    origins = {"-2.5e-1": None, **dict.fromkeys(("1_0", "1d5", "0x1", "inf"), "origin")}
+    cases = {name: (texts.text_ply(body), wrong or None) for name, (body, wrong) in texts.LAYOUTS.items()}
+    cases |= {f"number {word}": (ply(word, "float"), None) for word in texts.NUMBERS}
+    cases |= {f"no number {word!r}": (ply(word, "float"), place) for word in texts.NO_NUMBERS}
+    cases |= {f"integer {word}": (ply(word, "uchar"), None) for word in texts.INTEGERS}
+    cases |= {f"no integer {word}": (ply(word, "uchar"), place) for word in texts.NO_INTEGERS}
+    rows = "".join(f"{texts.ROW.replace('0.25', word)}\n" for word in texts.hard_numbers(400))
+    cases["numbers that are hard to round"] = (texts.text_ply(rows, 400), None)
+    for word, refused in origins.items():
+        comment = f"comment csplat origin {word} 2 3\n"
+        cases[f"origin {word}"] = (texts.text_ply(f"{texts.ROW}\n", 1, comment=comment), refused)
+    assert [] == failures(cases, check)
+
+
+def test_rounds_doubles_of_texts_once(library):
+    words = texts.hard_numbers(3000, seed=1)
+    rows = "".join(f"{word} 2 3 {texts.ROW.split(' ', 3)[3]}\n" for word in words if abs(float(word)) < 1e30)
+    data = texts.text_ply(rows, rows.count("\n"), comment="comment csplat origin 0 0 0\n")
+    arrays, _ = read_in_c(library, data.replace(b"float x", b"double x"))
+    expected = [float(row.split()[0]) for row in rows.splitlines()]
+    assert expected == arrays["positions"][::3]
+
+
+def test_a_locale_with_decimal_commas_changes_nothing(tmp_path, library):
+    localedef = shutil.which("localedef")
+    made = localedef and subprocess.run(
+        [localedef, "-i", "de_DE", "-f", "UTF-8", tmp_path / "de_DE.UTF-8"], capture_output=True, check=False
+    )
+    if not made or made.returncode:
+        pytest.skip("localedef cannot make a locale with decimal commas")
+    (tmp_path / "text.ply").write_bytes(texts.text_ply(f"{texts.ROW}\n", 1, comment="comment csplat origin 0.5 2 3\n"))
+    program = (
+        "import ctypes, locale, sys; locale.setlocale(locale.LC_ALL, '')\n"
+        "assert locale.localeconv()['decimal_point'] == ','\n"
+        "data = open(sys.argv[2], 'rb').read(); memory = ctypes.create_string_buffer(4096)\n"
+        "print(ctypes.CDLL(sys.argv[1]).csplat_read_ply(data, ctypes.c_size_t(len(data)), None, memory, None))"
+    )
+    words = [sys.executable, "-c", program, library._name, str(tmp_path / "text.ply")]
+    locale = {"LOCPATH": str(tmp_path), "LC_ALL": "de_DE.UTF-8"}
+    assert b"0\n" == subprocess.run(words, env=os.environ | locale, capture_output=True, check=True).stdout
 
 
 def test_refuses_files_in_one_line_and_writes_nothing(tool, tmp_path):

@@ -326,7 +326,7 @@ def _comment_error(comment: str, reason: str) -> InputError:
 def _parse_numbers(key: str, values: Sequence[str], count: int) -> list[float]:
     """Parse the values of a comment; raise an `InputError` unless they are `count` finite numbers."""
     try:
-        numbers = [float(value) for value in values]
+        numbers = [float(value.replace("_", "?")) for value in values]  # Python accepts 1_000
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,7 +34,8 @@ _SHOWN = 80  # maximum number of characters of a word in a message
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
-_ASCII = bytes(byte if byte < 128 and byte not in range(0x1C, 0x20) else ord("?") for byte in range(256))
+#: Bytes as ASCII, in which only space, tab, line ends, form feed and vertical tab separate words.
+ASCII = bytes(byte if byte < 128 and byte not in range(0x1C, 0x20) else ord("?") for byte in range(256))
 _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
 
 
@@ -123,7 +125,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         note = f"{counted(unread, 'byte')} of the header are not ASCII, nor UTF-8 in a comment"
         lost = (f"{counted(unread, 'byte')} of names or comments of the header",)
         findings.append(Finding("non-ascii-header", unread, f"{note}: read as question marks", "note", lost=lost))
-    text = text.translate(_ASCII)
+    text = text.translate(ASCII)
     lines = [line.split() for line in _split(text)]
     if sum(words[:1] in ([b"element"], [b"property"]) for words in lines) > _MAX_DECLARED:
         raise InputError(f"{path.name}: the header declares more than {_MAX_DECLARED:,} elements and properties")
@@ -272,6 +274,7 @@ _SPELLINGS = {
     "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
     "an exponent as Fortran writes it": (_EXPONENT, r"\1e\2"),
 }
+_POINT = re.compile(r"\.(?!#)")  # not of Microsoft's 1.#INF
 _DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
 _NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
 
@@ -284,31 +287,51 @@ class RowError(ValueError):
         self.finding = finding
 
 
+class TextRows(NamedTuple):
+    """Rows of an element of a text.
+
+    Attributes:
+        rows: the words of each row.
+        lines: number of the line in the file where each row begins, from 1.
+    """
+
+    rows: list[str]
+    lines: list[int]
+
+
+def count_lines(header: bytes) -> int:
+    """Return the number of lines of a header."""
+    return len(_LINE_END.findall(header))
+
+
 def parse_text_rows(
-    body: bytes, elements: Sequence[PlyElement], wanted: Sequence[str]
-) -> tuple[dict[str, list[str]], list[Finding]]:
+    body: bytes, elements: Sequence[PlyElement], wanted: Sequence[str], lines_before: int = 0
+) -> tuple[dict[str, TextRows], list[Finding]]:
     """Split text of any layout into rows.
+
+    The encoder in C has the same rules (`check_layout` and `find_layout` of csplat_ply.c).
 
     Args:
         body: the file after its header.
         elements: the declared elements.
         wanted: names of the elements whose rows are returned.
+        lines_before: number of lines of the header.
 
     Returns:
-        The rows of each wanted element, as lines of words, and the findings.
+        The rows of each wanted element, with numbers as Python writes them, and the findings.
 
     Raises:
         RowError: rows are missing, or a row has another number of values than declared.
     """
-    text = body.decode("ascii", "replace")
-    oddities = []
-    for name, (pattern, spelling) in _SPELLINGS.items():
-        text, count = pattern.subn(spelling, text)
-        oddities += [f"{name} ({counted(count, 'number')})"] if count else []
+    text = body.translate(ASCII).decode("ascii")
     first: RowError | None = None
     for separated, separators in _separations(text):
+        oddities, spelled = [], separated
+        for name, (pattern, spelling) in _SPELLINGS.items():
+            spelled, count = pattern.subn(spelling, spelled)
+            oddities += [f"{name} ({counted(count, 'number')})"] if count else []
         try:
-            rows, layout, rest = _split_rows(_TEXT_LINE_END.split(separated), elements, wanted)
+            rows, layout, rest = _split_rows(_TEXT_LINE_END.split(spelled), elements, wanted, lines_before)
         except RowError as error:
             first = first or error
             continue
@@ -326,15 +349,15 @@ def parse_text_rows(
 def _separations(text: str) -> Iterator[tuple[str, str]]:
     """Yield the text with only spaces between numbers, for each possible meaning of its commas."""
     if "," in text or ";" in text:
-        if "." not in text and _NO_THOUSANDS.search(text):
+        if not _POINT.search(text) and _NO_THOUSANDS.search(text):
             yield _DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"
         yield text.replace(",", " ").replace(";", " "), "commas or semicolons between numbers"
     yield text, ""
 
 
 def _split_rows(
-    lines: list[str], elements: Sequence[PlyElement], wanted: Sequence[str]
-) -> tuple[dict[str, list[str]], list[str], int]:
+    lines: list[str], elements: Sequence[PlyElement], wanted: Sequence[str], lines_before: int
+) -> tuple[dict[str, TextRows], list[str], int]:
     """Return the rows of the wanted elements, the oddities of the lines, and the number of bytes after the last row.
 
     Rows may share a line or continue on the next line, provided that every line end is a row end or every row end is a
@@ -347,19 +370,20 @@ def _split_rows(
     counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
     filled = np.flatnonzero(counts)
     oddities = ["blank lines"] if len(filled) and filled[-1] >= len(filled) else []
-    lines, counts = [line for line in lines if line.strip()], counts[filled]
-    rows: dict[str, list[str]] = {}
+    lines, counts = [lines[place] for place in filled], counts[filled]
+    numbers = filled + lines_before + 1
+    rows: dict[str, TextRows] = {}
     at = 0  # line of the next row
     for element in elements:
         width, count = len(element.properties), element.count
-        if not width:
+        if not width and count:
             raise RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
         stop = at + count
         if element.has_lists or (counts[at:stop] == width).all():
             if len(lines) < stop:
                 raise RowError(truncated_finding(element.name, count, len(lines) - at))
             if element.name in wanted:
-                rows[element.name] = lines[at:stop]
+                rows[element.name] = TextRows(lines[at:stop], numbers[at:stop].tolist())
             at = stop
             continue
         ends = np.cumsum(counts[at : at + width * count])
@@ -367,17 +391,20 @@ def _split_rows(
         common_ends = np.count_nonzero(ends[:line_count] % width == 0)  # ends of a line and a row
         if line_count > len(ends) or ends[line_count - 1] != width * count or common_ends not in (count, line_count):
             row = int((counts[at:] != width).argmax())
-            text = f"row {row} of {element.name} has {counts[at + row]} values, expected {width}"
+            place = f"line {numbers[at + row]}: row {row} of {element.name}"
+            text = f"{place} has {counts[at + row]} values, expected {width}"
             raise RowError(Finding("malformed", 1, text, "error"))
         if element.name in wanted:
             words = [word for line in lines[at : at + line_count] for word in line.split()]
-            rows[element.name] = [" ".join(words[first : first + width]) for first in range(0, len(words), width)]
+            starts = np.searchsorted(ends, np.arange(count) * width, side="right")
+            joined = [" ".join(words[first : first + width]) for first in range(0, len(words), width)]
+            rows[element.name] = TextRows(joined, numbers[at + starts].tolist())
         layout = f"{count} of {element.name} in {line_count} lines" if line_count > 1 else "all values in one line"
         oddities.append(layout)
         at += line_count
     surplus = int(counts[at:].sum())  # values after the last row
     if surplus and at != sum(element.count for element in elements):
-        text = f"found {counted(surplus, 'value')} after rows that are not on separate lines"
+        text = f"line {numbers[at]}: found {counted(surplus, 'value')} after rows that are not on separate lines"
         raise RowError(Finding("malformed", surplus, text, "error"))
     return rows, oddities, len(" ".join(" ".join(lines[at:]).split()))
 

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count as count_from
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -46,6 +47,7 @@ from csplat.ply.ply_header import (
     SPLAT_ELEMENT,
     PlyHeader,
     RowError,
+    count_lines,
     parse_text_rows,
     read_ply_header,
     truncated_finding,
@@ -64,6 +66,7 @@ _PACKED_COLOURS = ("colors", "color", "rgb")
 _FORMATS = {"=": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}  # by plyfile's byte order
 _SHOWN = 40  # maximum number of characters of a word in a message
 _SHOWN_NAMES = 200  # characters of names in a message, which may be a MiB long
+_SEPARATORS = dict.fromkeys(range(0x1C, 0x20), "?")  # of words for Python alone
 _DAMAGED = (plyfile.PlyParseError, ValueError, OverflowError, MemoryError)  # what plyfile and NumPy raise
 
 
@@ -469,14 +472,16 @@ def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Fin
         rows_size = file.seek(0, io.SEEK_END) - header.end
         file.seek(header.end)
         stream = io.TextIOWrapper(file, encoding="ascii", errors="replace", newline="")
+        lines = (line.translate(_SEPARATORS) for line in stream)
         for element, header_element in zip(declared, header.elements, strict=True):
             absent = RowError(truncated_finding(header_element.name, header_element.count, 0))
             # Refuse before memory for the rows is allocated: a value takes a digit and a separator, except the last.
-            if header_element.count * 2 * len(header_element.properties) > rows_size + 1:
+            width, count = len(header_element.properties), header_element.count
+            if count * 2 * width > rows_size + 1 or (count and not width):
                 raise absent
             if _is_needed(element):
-                rows[header_element.name] = _parse_lines(declared, element, header_element.count, stream)
-            elif header_element.count != sum(1 for _ in islice(_scalar_lines(element, stream), header_element.count)):
+                rows[header_element.name] = _parse_lines(declared, element, header_element.count, lines)
+            elif header_element.count != sum(1 for _ in islice(_scalar_lines(element, lines), header_element.count)):
                 raise absent
         surplus_bytes = len(stream.read().strip())
     findings += _rest_findings(surplus_bytes)
@@ -486,32 +491,43 @@ def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Fin
 def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
     """Read text of any layout, as `parse_text_rows` splits it; as in `_read_rows`."""
     with open_binary(path) as stream:
-        stream.seek(header.end)
+        lines_before = count_lines(stream.read(header.end))
         needed = [element.name for element in declared if _is_needed(element)]
-        lines, more = parse_text_rows(stream.read(), header.elements, needed)
+        texts, more = parse_text_rows(stream.read(), header.elements, needed, lines_before)
     findings += more
     rows: dict[str, Rows] = {}
-    for name, row_lines in lines.items():
+    for name, text in texts.items():
         try:
-            rows[name] = _parse_lines(declared, declared[name], len(row_lines), row_lines)
+            rows[name] = _parse_lines(declared, declared[name], len(text.rows), text.rows, text.lines)
         except plyfile.PlyElementParseError as error:
-            row = next(islice(_scalar_lines(declared[name], row_lines), error.row or 0, None)).split()
-            raise RowError(_row_finding(error, row)) from None
+            row = next(islice(_scalar_lines(declared[name], text.rows), error.row or 0, None)).split()
+            raise RowError(_row_finding(error, row, text.lines)) from None
     return rows
 
 
-def _scalar_lines(element: Any, lines: Iterable[str]) -> Iterator[str]:
-    """Return text rows of an element without the values of its lists."""
-    return lines_without_lists(lines, element.name, element.properties)
+def _scalar_lines(element: Any, lines: Iterable[str], numbers: Sequence[int] | None = None) -> Iterator[str]:
+    """Return text rows of an element without the values of its lists; `numbers` are their lines, for messages."""
+    return lines_without_lists(lines, element.name, element.properties, numbers)
 
 
-def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) -> Rows:
+def _parse_lines(
+    declared: Any, element: Any, count: int, lines: Iterable[str], numbers: Sequence[int] | None = None
+) -> Rows:
     """Parse the first `count` lines, a row each, without the values of lists; as in `_read_rows`."""
     if any(map(is_list, element.properties)):
-        lines = _scalar_lines(element, lines)
+        lines = _scalar_lines(element, lines, numbers)
+    rows_read = count_from(0)
+    lines = (line.replace("_", "?") for line, _ in zip(lines, rows_read, strict=False))  # Python accepts 1_000
     header = io.StringIO(_element_header(declared, element, count).decode())
     stream = SimpleNamespace(read=header.read, readline=partial(next, iter(lines), ""))
-    rows: Rows = plyfile.PlyData.read(stream)[element.name].data
+    try:
+        rows: Rows = plyfile.PlyData.read(stream)[element.name].data
+    except OverflowError:
+        row = next(rows_read) - 1
+        place = (
+            f"row {row} of {element.name}" if numbers is None else f"line {numbers[row]}: row {row} of {element.name}"
+        )
+        raise RowError(Finding("malformed", 1, f"{place} has an integer beyond its type", "error")) from None
     return rows
 
 
@@ -522,15 +538,15 @@ def _element_header(declared: Any, element: Any, count: int) -> bytes:
     return "\n".join(["ply", *lines, "end_header", ""]).encode("ascii")
 
 
-def _row_finding(error: Any, words: list[str]) -> Finding:
-    """Report the invalid value of a text row."""
+def _row_finding(error: Any, words: list[str], lines: Sequence[int]) -> Finding:
+    """Report the invalid value of a text row, which has these words; `lines` are those of all rows."""
     name, row, text = error.element.name, error.row or 0, error.message
     if error.prop is not None:
         word = words[[prop.name for prop in error.element.properties].index(error.prop.name)]
         kind = np.dtype(error.prop.val_dtype)
         expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
         text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
-    return Finding("malformed", 1, f"row {row} of {name}: {text}", "error")
+    return Finding("malformed", 1, f"line {lines[row]}: row {row} of {name}: {text}", "error")
 
 
 def _list_findings(names: list[str]) -> list[Finding]:

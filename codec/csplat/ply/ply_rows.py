@@ -86,13 +86,16 @@ def skip_lists(
     return at
 
 
-def lines_without_lists(lines: Iterable[str], name: str, properties: Sequence[Any]) -> Iterator[str]:
+def lines_without_lists(
+    lines: Iterable[str], name: str, properties: Sequence[Any], numbers: Sequence[int] | None = None
+) -> Iterator[str]:
     """Yield rows of text without their lists.
 
     Args:
         lines: a row each.
         name: name of the element.
         properties: properties of the element.
+        numbers: the lines of the rows in the file, for messages.
 
     Raises:
         RowError: a row has another number of values than declared, or the length of a list is not a count.
@@ -114,6 +117,7 @@ def lines_without_lists(lines: Iterable[str], name: str, properties: Sequence[An
                     at = -1  # not a count: matches no number of words
                     break
         if at != len(words):
-            text = f"row {row} of {name} has {len(words)} values, which its properties do not match"
+            place = "" if numbers is None else f"line {numbers[row]}: "
+            text = f"{place}row {row} of {name} has {len(words)} values, which its properties do not match"
             raise RowError(Finding("malformed", 1, text, "error"))
         yield " ".join(scalars)

@@ -11,8 +11,6 @@
 #define IMPORT(name) __attribute__((import_module("env"), import_name(#name)))
 
 IMPORT(progress) int js_progress(double done);
-/* Parse a number of a text; return 0 if it is none. */
-IMPORT(parse_number) int js_parse_number(const char *text, size_t size, double *value);
 
 /* The fields of a scene, which both sides write, as doubles; ../encoder.mjs has the same list. */
 enum { COUNT, DEGREE, MEANS, QUATS, SCALES, OPACITIES, SH0, SHN, POSITIONS, ORIGIN, UNIT = ORIGIN + 3, AXES, ANTIALIASED = AXES + 3,
@@ -61,14 +59,6 @@ int snprintf(char *out, size_t size, const char *format, ...)
     result = vsnprintf(out, size, format, arguments);
     va_end(arguments);
     return result;
-}
-
-double strtod(const char *text, char **end)
-{
-    double value = 0.0;
-    size_t size = strlen(text);
-    *end = (char *)(uintptr_t)text + (js_parse_number(text, size, &value) ? size : 0);
-    return value;
 }
 
 static int report(void *user, double done)

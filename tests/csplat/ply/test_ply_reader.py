@@ -9,6 +9,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import text_plys as texts
 from checked import flipped, refusals
 from formats_cases import zip_of
 from hypothesis import given, settings
@@ -100,6 +101,42 @@ def test_header_comments_are_kept(tmp_path, kind):
     assert {"unnormalised-quats"} == {one.id for one in report}
     write_ply(tmp_path / "b.ply", model)
     assert model.metadata == read_ply(tmp_path / "b.ply").metadata
+
+
+def test_text_has_one_grammar_of_numbers_and_rows(tmp_path):
+    # `test_c_encoder.py` has the same cases: both readers accept the same texts, and name the same lines.
+    path = tmp_path / "text.ply"
+
+    def read(data):
+        path.write_bytes(data)
+        return read_ply(path, keep_extra=True)
+
+    def check_layout(name):
+        body, place = texts.LAYOUTS[name]
+        if name in texts.REFUSED:
+            with pytest.raises(InputError, match=place):
+                read(texts.text_ply(body))
+            return
+        model = read(texts.text_ply(body))
+        assert [[1, 2, 3]] * 2 == model.means.tolist()
+        assert [[0.5, 0.25, 0.125]] * 2 == model.sh0.tolist()
+
+    assert [] == failures({name: name for name in texts.LAYOUTS}, check_layout)
+
+    def body(word):
+        return f"{texts.ROW} {word}\n{texts.ROW} 1\n"
+
+    for word, value in texts.NUMBERS.items():
+        found = read(texts.text_ply(body(word), extra="property double more\n")).extra["more"][0]
+        assert np.array_equal(np.float64(value), found, equal_nan=True), word
+    for word in texts.INTEGERS:
+        assert int(word) == read(texts.text_ply(body(word), extra="property uchar more\n")).extra["more"][0]
+    for kind, words in (("float", texts.NO_NUMBERS), ("uchar", texts.NO_INTEGERS)):
+        for word in words:
+            with pytest.raises(InputError):
+                read(texts.text_ply(body(word), extra=f"property {kind} more\n"))
+    with pytest.raises(InputError, match="origin"):
+        read(texts.text_ply(f"{texts.ROW}\n{texts.ROW}\n", comment="comment csplat origin 1_0 2 3\n"))
 
 
 def test_extra_columns_are_kept_on_request(tmp_path, make_model):
