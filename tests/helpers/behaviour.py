@@ -249,7 +249,7 @@ def keys_group(folder: Path) -> Iterator[tuple[str, Json]]:
         ("render", ("render", small, folder / "renders", "--cameras", views)),
         ("simplify", ("simplify", small, folder / "simple.ply", "--keep", "0.6", "--cameras", views)),
         ("sensitivity", ("sensitivity", small, folder / "small.npz", "--cameras", views)),
-        ("train", ("train", images, ply, "--max-splats", "50", "--sh-degree", "1", "--iterations", "5")),
+        ("train", ("train", images, ply, "--max-splats", "50", "--sh-degree", "1", "--iterations", "50")),
         ("train to a file", ("train", images, folder / "trained.csplat", "--max-splats", "50", "--iterations", "5")),
         ("finetune", ("finetune", ply, tuned, "--data", images, "--iterations", "2")),
         ("export-html", ("export-html", file, folder / "page.html")),

@@ -154,7 +154,8 @@ def _dense_core(model: SplatModel, frame: SceneFrame) -> Mask:
     beyond = np.searchsorted(away, _CORE_GAP * away[first:], side="right") - np.arange(first + 1, len(away) + 1)
     radius = away[first + int(np.argmax(beyond <= _GAP_SHARE * len(away)))]
     core: Mask = distances <= radius
-    return core
+    sizes = np.exp(_clipped_scales(model)[core].max(axis=1))
+    return core if radius > float(np.median(sizes)) else everything  # splats in one place are no scene
 
 
 def viewing_frame(model: SplatModel) -> SceneFrame:
