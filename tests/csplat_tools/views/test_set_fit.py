@@ -43,13 +43,14 @@ def normalised(model, seed):
 
 
 def test_a_scene_fits_unless_a_single_colour_and_the_mean_image_are_as_good():
-    # The errors are those of lego200, fox and desk29 in dB: the scene, a single colour, the mean of the other images.
+    # The errors are those of lego200, fox and desk29 in dB: the scene, a single colour, the mean of the images.
     cases = {
         "trained to the end": (29.1, 12.0, 13.0, True),
         "200 steps": (15.6, 12.0, 13.0, True),
-        "few steps of an object": (14.7, 10.8, 13.3, True),
-        "turned": (10.9, 10.8, 13.3, False),
-        "scaled": (12.5, 13.0, 14.2, False),
+        "few steps of an object": (13.8, 10.8, 14.0, True),
+        "turned": (10.9, 10.8, 14.0, False),
+        "turned by 90 degrees": (14.1, 13.0, 14.7, False),
+        "scaled": (12.5, 13.0, 14.7, False),
         "nothing in view": (5.2, 12.0, 13.0, False),
         "images that hardly differ": (20.0, 12.0, 30.0, True),
         "empty images": (90.0, 99.0, 99.0, True),

@@ -2,10 +2,11 @@
 """Decide if a scene fits a data set: if its renders look like the photographs.
 
 Programs that normalise coordinates (gsplat, nerfstudio) write scenes that no longer fit the poses of the set. All
-commands use this rule: a scene does not fit if its renders are farther from the photographs than the mean of the other
-photographs is, and no better than a single colour by `_MARGIN_DB`. Measured at most 128 pixels wide on lego200, fox and
-desk29, in dB above the single colour: scenes after 200 steps of training 3.6 to 10.4, and 10.5 to 17.9 if trained to
-their end; 96 scenes that were turned, moved and scaled at random, −7.8 to 0.6.
+commands use this rule: a scene does not fit if its renders are farther from the photographs than their mean is, and no
+better than a single colour by `_MARGIN_DB`. Measured at most 128 pixels wide on lego200, fox, desk29 and two synthetic
+sets, in dB above the single colour: scenes after 200 steps of training 3.6 to 10.4, trained to their end 9.1 to 50; of
+60 copies that were turned, moved and scaled at random at most 0.0, of other sets' scenes at most −0.9, and of quarter
+turns 1.4. Turns by 10 degrees and scales of 0.8 are hardly ever found: their renders resemble the photographs.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class SetFit:
         count: number of images compared.
         scene: error of the scene's renders.
         colour: error of the mean colour of all images.
-        mean_image: error of the mean of the other images; infinite for images of several sizes.
+        mean_image: error of the mean of the images; infinite for images of several sizes.
     """
 
     count: int
@@ -98,10 +99,9 @@ def measure_fit(
     pixels = np.concatenate([value[mask] for value, mask in zip(values, counted_pixels, strict=True)])
     colour, mean_image = float(np.mean((pixels - pixels.mean(axis=0)) ** 2)), np.inf
     if len({value.shape for value in values}) == 1 and len(values) > 1:
-        others = len(values) / (len(values) - 1.0)  # difference to the mean of the others, by that to the mean of all
         middle = np.mean(values, axis=0)
         differences = [(value - middle)[mask] for value, mask in zip(values, counted_pixels, strict=True)]
-        mean_image = float(np.mean((others * np.concatenate(differences)) ** 2))
+        mean_image = float(np.mean(np.concatenate(differences) ** 2))
     return SetFit(len(chosen), scorer.pooled(scorer.errors(model)), colour, mean_image)
 
 
