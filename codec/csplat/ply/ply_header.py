@@ -150,7 +150,7 @@ def _parse_comments(lines: Sequence[bytes]) -> tuple[list[str], int]:
             with suppress(UnicodeDecodeError):
                 comments.append(data.decode("utf-8"))
                 continue
-            comments.append(data.translate(_ASCII).decode("ascii"))
+            comments.append(data.translate(ASCII).decode("ascii"))
         unread += sum(byte > 127 for byte in line)
     return comments, unread
 
