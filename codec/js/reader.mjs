@@ -153,6 +153,8 @@ export class Reader {
     this.inflates = false;
     /** @type {Set<number>} offsets of the chunks whose CRC has been checked */
     this.checked = new Set();
+    /** Chunks that were fetched for nothing, by offset. @type {Map<number, Bytes>} */
+    this.unused = new Map();
     /** Total milliseconds that reads have waited for bytes; concurrent reads count separately. */
     this.waitedMs = 0;
     this.codebooks = codebooksById(header.codebooks);
@@ -294,7 +296,16 @@ export class Reader {
     for (const [key, { layer, offset }] of record ? [] : this.codebookChunks) {
       if (layer <= wanted.shDegree) parts.push([offset, await this.codebookChunk(key)]); // every worker needs them
     }
-    return new Map(parts.map(([offset, bytes]) => [offset, bytes.slice()])); // in buffers of their own, to transfer
+    return new Map(parts);
+  }
+
+  /**
+   * Keep chunks that were fetched for nothing, until they are wanted again.
+   *
+   * @param {Map<number, Bytes>} parts by offset
+   */
+  keep(parts) {
+    for (const [offset, bytes] of parts) this.unused.set(offset, bytes);
   }
 
   /**
@@ -519,7 +530,10 @@ export class Reader {
    * @param {number} index
    */
   forget(index) {
-    for (const place of checkedTile(index, this.header).layers) this.kept.delete(place);
+    for (const place of checkedTile(index, this.header).layers) {
+      this.kept.delete(place);
+      this.unused.delete(place.offset);
+    }
     this.open.delete(index);
   }
 
@@ -530,6 +544,11 @@ export class Reader {
    */
   async fetch(place, signal) {
     signal?.throwIfAborted();
+    const kept = this.unused.get(place.offset);
+    if (kept !== undefined) {
+      this.unused.delete(place.offset);
+      return kept;
+    }
     const before = performance.now();
     const bytes = await this.source.read(place.offset, place.size, signal);
     this.waitedMs += performance.now() - before;

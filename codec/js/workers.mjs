@@ -14,47 +14,85 @@ import { abortable } from './transport.mjs';
  */
 
 const IDLE_MS = 5000; // an idle worker ends after this; starting one takes about as long as decoding 100,000 splats
+const START_MS = 15000; // a worker that has not answered its first request by then has not started
 
-/** A worker that answers requests one at a time. */
+/** Workers may start: none has failed before its first answer. Its script is then missing or forbidden. */
+let mayStart = true;
+
+/** A worker that answers requests one at a time. After it has failed, at whatever moment, each answer is null. */
 class Correspondent {
   /** @param {any} worker a worker of the browser or of Node */
   constructor(worker) {
     this.worker = worker;
+    this.hasAnswered = this.hasFailed = false;
     /** @type {(answer: Answer | null) => void} */
     this.answered = () => {};
-    const message = (/** @type {Answer} */ answer) => this.answered(answer);
-    const failed = (/** @type {Event | Error} */ event) => {
-      if ('preventDefault' in event) event.preventDefault(); // not logged: decoding continues without it
-      this.answered(null);
-    };
-    if (worker.addEventListener) {
-      worker.addEventListener('message', (/** @type {MessageEvent} */ { data }) => message(data));
-      worker.addEventListener('error', failed);
-    } else {
-      worker.on('message', message);
-      worker.on('error', failed);
+    const listen = (/** @type {string} */ type, /** @type {(event: any) => void} */ listener) =>
+      worker.addEventListener ? worker.addEventListener(type, listener) : worker.on(type, listener);
+    listen('message', (event) => {
+      this.hasAnswered = true;
+      this.answered(worker.addEventListener ? event.data : event);
+    });
+    for (const type of ['error', 'messageerror', 'exit']) {
+      listen(type, (event) => {
+        event.preventDefault?.(); // not logged: decoding continues without it
+        this.fail();
+      });
     }
   }
 
+  fail() {
+    if (this.hasFailed) return;
+    this.hasFailed = true;
+    mayStart &&= this.hasAnswered;
+    clearTimeout(idle.get(this));
+    idle.delete(this);
+    this.answered(null);
+    this.end();
+  }
+
+  end() {
+    this.hasFailed = true;
+    this.worker.terminate();
+  }
+
   /**
-   * @param {Request} request
+   * @param {Request} request its parts are copied
    * @returns {Promise<Answer | null>} null if the worker has failed or never started
    */
-  ask(request) {
-    return new Promise((resolve) => {
-      this.answered = resolve;
-      this.worker.postMessage(request, buffersOf(request));
-    });
+  async ask(request) {
+    if (this.hasFailed) return null;
+    const copy = (/** @type {import('./csplat-worker.mjs').Parts} */ parts) =>
+      new Map([...parts].map(([offset, bytes]) => [offset, bytes.slice()])); // in buffers of their own, to transfer
+    const sent =
+      'open' in request ? { ...request, open: copy(request.open) } : { ...request, parts: copy(request.parts) };
+    const start = this.hasAnswered ? undefined : setTimeout(() => this.fail(), START_MS);
+    try {
+      return await new Promise((resolve) => {
+        this.answered = resolve;
+        this.worker.postMessage(sent, buffersOf(sent));
+      });
+    } catch {
+      return null; // decoding in this thread reports the error
+    } finally {
+      clearTimeout(start);
+    }
   }
 }
 
 /** @type {Map<Correspondent, ReturnType<typeof setTimeout>>} idle workers, and the timers that end them */
 const idle = new Map();
 
-/** @returns {Promise<Correspondent>} */
+/** @returns {Promise<Correspondent | null>} null if none starts */
 async function take() {
   const [known] = idle;
-  if (known === undefined) return start();
+  if (known === undefined) {
+    if (!mayStart) return null;
+    return start().catch(() => {
+      mayStart = false;
+      return null;
+    });
+  }
   clearTimeout(known[1]);
   idle.delete(known[0]);
   known[0].worker.ref?.();
@@ -66,7 +104,7 @@ function giveBack(worker) {
   worker.worker.unref?.(); // Node may exit
   const end = () => {
     idle.delete(worker);
-    worker.worker.terminate();
+    worker.end();
   };
   const timer = setTimeout(end, IDLE_MS);
   /** @type {any} */ (timer).unref?.();
@@ -99,15 +137,11 @@ async function start() {
 async function decodeTile(reader, worker, tile, wanted, isFirst, spare, signal) {
   const opening = isFirst ? await reader.partsOf(wanted) : null;
   const parts = await reader.partsOf(wanted, tile, signal);
-  try {
-    if (opening && (await worker.ask({ open: opening, wanted })) === null) return { worker, tile };
-    const offsets = [...parts.keys()];
-    const answer = await worker.ask({ tile: tile.index, parts, spare });
-    if (answer?.fields) for (const offset of offsets) reader.checked.add(offset);
-    return { worker, tile, fields: answer?.fields };
-  } catch {
-    return { worker, tile }; // decoding in this thread reports the error
-  }
+  const opened = opening === null || (await worker.ask({ open: opening, wanted })) !== null;
+  const answer = opened ? await worker.ask({ tile: tile.index, parts, spare }) : null;
+  if (answer?.fields) for (const offset of parts.keys()) reader.checked.add(offset);
+  else reader.keep(parts);
+  return { worker, tile, fields: answer?.fields };
 }
 
 /**
@@ -133,7 +167,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
   const tables = new Map();
   try {
     for (const tile of waiting.splice(Math.max(0, waiting.length - count)).reverse()) {
-      const worker = await take().catch(() => null);
+      const worker = await take();
       if (worker === null) waiting.push(tile);
       else start(worker, tile, true);
     }
@@ -141,7 +175,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
       const { worker, tile, fields } = await abortable(Promise.race(jobs.values()), signal);
       signal?.throwIfAborted();
       if (fields === undefined) {
-        worker.worker.terminate();
+        worker.end();
         jobs.delete(worker);
         waiting.push(tile);
         continue;
@@ -157,7 +191,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
       yield { tile, fields, worker };
     }
   } finally {
-    for (const { worker } of jobs.keys()) worker.terminate();
+    for (const worker of jobs.keys()) worker.end();
   }
 }
 
@@ -187,13 +221,15 @@ export class LayerWorkers {
     const parts = place && !reader.inflates ? await reader.layerParts(tile, place, signal) : new Map();
     signal?.throwIfAborted();
     const one = parts.size > 0 ? (this.free.pop() ?? (await this.#start())) : null;
-    const sent = new Map([...parts].filter(([at]) => !one?.known.has(at)).map(([at, bytes]) => [at, bytes.slice()]));
-    const offsets = [...sent.keys()];
-    const answer = await one?.worker.ask({ tile: tile.index, layer, parts: sent }).catch(() => null);
-    if (!answer?.fields) one?.worker.worker.terminate();
-    if (!one || !answer?.fields) return reader.readLayer(tile.index, layer, { form: 'packed', signal }); // reports the error
+    const sent = new Map([...parts].filter(([at]) => !one?.known.has(at)));
+    const answer = await one?.worker.ask({ tile: tile.index, layer, parts: sent });
     const chunks = tile.layers.map(({ offset }) => offset);
-    for (const offset of offsets) {
+    if (!one || !answer?.fields) {
+      one?.worker.end();
+      reader.keep(new Map([...parts].filter(([offset]) => chunks.includes(offset))));
+      return reader.readLayer(tile.index, layer, { form: 'packed', signal }); // reports the error
+    }
+    for (const offset of sent.keys()) {
       reader.checked.add(offset);
       if (!chunks.includes(offset)) one.known.add(offset);
     }
@@ -204,10 +240,8 @@ export class LayerWorkers {
   }
 
   async #start() {
-    const worker = await take().catch(() => null);
-    const opening = new Map([...this.reader.opening].map(([offset, bytes]) => [offset, bytes.slice()]));
-    const wanted = { shDegree: 0, extra: false };
-    const answer = await worker?.ask({ open: opening, wanted }).catch(() => null);
+    const worker = await take();
+    const answer = await worker?.ask({ open: this.reader.opening, wanted: { shDegree: 0, extra: false } });
     return worker && answer ? { worker, known: /** @type {Set<number>} */ (new Set()) } : null;
   }
 

@@ -102,6 +102,33 @@ test('a loop over tiles can end early', async () => {
   assert.equal(count, 3 * reader.header.tiles[1].splatCount);
 });
 
+const WAYS = ['construction', 'script', 'silence', 'first request', 'first answer', 'second request', 'third request'];
+test('workers that fail in any way, early or late, leave the work to the calling thread, which fetches nothing again', () => {
+  const { file, expect } = several.find(({ expect: { header } }) => header.tile_count > 3);
+  const path = fileURLToPath(new URL(`../../../conformance/csplat_conformance/vectors/${file}`, import.meta.url));
+  const script = fileURLToPath(new URL('failing_workers.mjs', import.meta.url));
+  const seen = {};
+  const wanted = {};
+  for (const way of WAYS) {
+    for (const [moment, task] of [
+      ['before the tiles', 'tiles'],
+      ['with the tiles', 'layers'],
+    ]) {
+      const { stdout, stderr } = spawnSync(process.execPath, [script, path, way, moment, task], {
+        encoding: 'utf8',
+        timeout: 10_000,
+      });
+      seen[`${way}, ${moment}, ${task}`] = stdout.trim() || stderr || 'nothing';
+      // Two workers start together for tiles; no other is tried once one has failed to start.
+      const known = way === 'construction' || task === 'layers' ? 1 : 2;
+      const starts = /^(?:second|third)/.test(way) ? stdout.match(/\d+$/m)?.[0] : known;
+      wanted[`${way}, ${moment}, ${task}`] = `all splats 1 ${starts}`;
+    }
+  }
+  assert.ok(expect.header.splat_count > 3);
+  assert.deepEqual(seen, wanted);
+});
+
 test('decode works if no worker can start', () => {
   const script = `
     import { readFileSync } from 'node:fs';
