@@ -14,33 +14,19 @@ export { CsplatError };
 /**
  * Start a worker.
  *
- * @returns {Promise<{post: (message: unknown) => void, listen: (use: (message: any) => void) => void,
- *   onError: (use: (error: unknown) => void) => void, end: () => void}>}
+ * @returns {Promise<any>} a worker of the browser or of Node
  */
 async function startWorker() {
   if (typeof Worker === 'function') {
-    const worker = new Worker(new URL('./encoder-worker.mjs', import.meta.url), { type: 'module' });
-    return {
-      post: (message) => worker.postMessage(message),
-      listen: (use) => worker.addEventListener('message', ({ data }) => use(data)),
-      onError: (use) =>
-        worker.addEventListener('error', ({ message }) => use(new Error(message || 'no worker starts'))),
-      end: () => worker.terminate(),
-    };
+    return new Worker(new URL('./encoder-worker.mjs', import.meta.url), { type: 'module' });
   }
   const [name, side] = ['node:worker_threads', './encoder-worker.mjs']; // bundlers need not find these
   const threads = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
-  const worker = new threads.Worker(new URL(side, import.meta.url));
-  return {
-    post: (message) => worker.postMessage(message),
-    listen: (use) => worker.on('message', use),
-    onError: (use) => worker.on('error', use),
-    end: () => worker.terminate(),
-  };
+  return new threads.Worker(new URL(side, import.meta.url));
 }
 
 /**
- * Do a task here, or in a worker of its own.
+ * Do a task here, or in a worker of its own; here, too, if none starts.
  *
  * @param {keyof typeof TASKS} task
  * @param {any} input
@@ -48,26 +34,43 @@ async function startWorker() {
  * @returns {Promise<any>}
  */
 async function run(task, input, options) {
-  const { worker = false, onProgress, signal, sourceIndex } = options;
+  const { worker: isWanted = false, onProgress, signal, sourceIndex } = options;
   signal?.throwIfAborted();
-  if (!worker) return TASKS[task](options, input);
-  const thread = await startWorker();
+  const worker = isWanted ? await startWorker().catch(() => null) : null;
+  if (worker === null) return TASKS[task](options, input);
+  const listen = (/** @type {string} */ type, /** @type {(event: any) => void} */ listener) =>
+    worker.addEventListener ? worker.addEventListener(type, listener) : worker.on(type, listener);
+  let hasStarted = false;
+  let stop = () => {};
   try {
-    return await new Promise((resolve, reject) => {
-      signal?.addEventListener('abort', () => reject(signal.reason), { once: true });
-      thread.onError(reject);
-      thread.listen(({ done, result, index, error, isCsplat }) => {
+    const done = await new Promise((resolve, reject) => {
+      stop = () => reject(signal?.reason);
+      signal?.addEventListener('abort', stop, { once: true });
+      for (const type of ['error', 'messageerror', 'exit']) {
+        listen(type, (event) => {
+          event.preventDefault?.();
+          const reason = event.message ? `: ${event.message}` : '';
+          if (hasStarted)
+            reject(new CsplatError(`E_LIMIT: the worker has failed, perhaps for lack of memory${reason}`));
+          else resolve(null);
+        });
+      }
+      listen('message', (event) => {
+        hasStarted = true;
+        const { done, result, index, error, isCsplat } = worker.addEventListener ? event.data : event;
         if (done !== undefined) onProgress?.(done);
         else if (error !== undefined) reject(isCsplat ? new CsplatError(error) : new Error(error));
         else {
           if (index) sourceIndex?.set(index);
-          resolve(result);
+          resolve({ result });
         }
       });
-      thread.post({ task, input, count: sourceIndex?.length });
+      worker.postMessage({ task, input, count: sourceIndex?.length });
     });
+    return done === null ? await TASKS[task](options, input) : done.result;
   } finally {
-    thread.end();
+    signal?.removeEventListener('abort', stop);
+    worker.terminate();
   }
 }
 

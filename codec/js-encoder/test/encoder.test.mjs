@@ -55,6 +55,38 @@ test('encodes a PLY, here and in a worker, to the same bytes', async () => {
   assert.ok(sourceIndex.some((row) => row > 0));
 });
 
+test('encodes here if no worker starts, and refuses if one fails at work', async () => {
+  const expected = await encode(await readPly(sample));
+  /** Ways to fail. @type {Record<string, (worker: EventTarget) => void>} */
+  const ways = {
+    construction: () => {
+      throw new DOMException('forbidden', 'SecurityError');
+    },
+    script: (worker) => setTimeout(() => worker.dispatchEvent(new Event('error')), 1),
+    message: (worker) => setTimeout(() => worker.dispatchEvent(new Event('messageerror')), 1),
+    work: (worker) => {
+      setTimeout(() => worker.dispatchEvent(new MessageEvent('message', { data: { done: 0.5 } })), 1);
+      setTimeout(() => worker.dispatchEvent(new Event('error')), 2);
+    },
+  };
+  const page = /** @type {any} */ (globalThis);
+  for (const [name, way] of Object.entries(ways)) {
+    page.Worker = class extends EventTarget {
+      constructor() {
+        super();
+        way(this);
+      }
+      postMessage() {}
+      terminate() {}
+    };
+    const encoded = encodePly(sample, { worker: true });
+    if (name === 'work') {
+      await assert.rejects(encoded, (error) => error instanceof CsplatError && error.code === 'E_LIMIT');
+    } else assert.deepEqual((await encoded).file, expected, name);
+  }
+  delete page.Worker;
+});
+
 test('states fields and metadata', async () => {
   const splats = await someSplats(300);
   const fields = {
