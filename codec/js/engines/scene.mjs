@@ -234,7 +234,7 @@ export class SplatScene {
   }
 
   /**
-   * Return two corners of the box of all centres, not turned.
+   * Return two corners of the box of all splats, three standard deviations of the largest around their centres, not turned.
    *
    * @template T
    * @param {new (x: number, y: number, z: number) => T} Vector of the engine
@@ -244,7 +244,10 @@ export class SplatScene {
   corners(Vector, header) {
     const all = header?.tiles ?? allTiles(this.file);
     const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
-      [0, 1, 2].map((axis) => Math[side](...all.map((tile) => tile[side][axis]))),
+      [0, 1, 2].map((axis) => {
+        const beyond = (/** @type {number} */ maxScale) => (side === 'min' ? -3 : 3) * Math.exp(Math.min(maxScale, 80));
+        return Math[side](...all.map((tile) => tile[side][axis] + beyond(tile.maxScale)));
+      }),
     );
     for (const [k, sign] of this.signs.entries()) if (sign < 0) [low[k], high[k]] = [-high[k], -low[k]];
     return [new Vector(low[0], low[1], low[2]), new Vector(high[0], high[1], high[2])];

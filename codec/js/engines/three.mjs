@@ -27,6 +27,10 @@ const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true
 const SH_WORDS = [0, 3, 4, 6]; // words per splat in a band, of four coefficients each
 const SH_ZERO = 0x80808080;
 const SORTED = 4; // radius of the sphere in whose 4,096 steps splats are sorted, by that of the ball around most of them
+const FINER = 16; // times more finely than in the usual range are depths sorted if
+const MOST = 0.99; // of what the camera sees is in such a range
+const RESORTED = 0.25; // change of the sorted depths, as a fraction of them, after which splats are sorted anew
+const TILES_MAX = 500; // of a scene whose depths are sorted where the camera looks; the effort grows with the square
 
 /** Loads splats as a geometry for GaussianSplat. */
 export class CSPLATLoader extends Loader {
@@ -139,8 +143,6 @@ async function geometryOf(scene) {
     const putOne = bands.put.bind(bands);
     const flush = drawing.flush.bind(drawing);
     await scene.drawLevels(new SplatPool(count, { put, fade, putBand: putOne, clear, flush }));
-    geometry.boundingBox = new Box3(...scene.corners(Vector3));
-    geometry.boundingSphere = geometry.boundingBox.getBoundingSphere(new Sphere());
   }
   for await (const tile of scene.tiles()) {
     put(tile, tile.first);
@@ -149,24 +151,109 @@ async function geometryOf(scene) {
   if (!antialiased)
     onceSaid(NAME, 'three.js draws all scenes as antialiased; small splats of this scene appear too faint');
   bands.addTo(geometry);
-  if (!geometry.boundingBox) {
-    geometry.computeBoundingBox();
+  const box = new Box3(...scene.corners(Vector3));
+  const whole = box.getBoundingSphere(new Sphere());
+  if (scene.levels) [geometry.boundingBox, geometry.boundingSphere] = [box, whole];
+  else {
+    geometry.computeBoundingBox(); // as three.js's loaders do, which leave out how large splats are
     geometry.computeBoundingSphere();
   }
   const upright = new Matrix4().set(a[0], a[1], a[2], 0, b[0], b[1], b[2], 0, c[0], c[1], c[2], 0, 0, 0, 0, 1);
   const facts = scene.facts(() => wholeOf(scene, geometry), geometry);
   const { centre, radius } = facts.bounds;
   const middle = new Vector3(...centre).applyMatrix4(upright.clone().invert());
-  // From a middle inside of it, twice the radius of a sphere reaches all of the sphere.
-  const sphere = new Sphere(middle, Math.min(SORTED * radius, 2 * (geometry.boundingSphere?.radius ?? Infinity)));
+  const reach = middle.distanceTo(whole.center) + whole.radius; // from the middle to all splats
+  const sphere = new Sphere(middle, Math.min(SORTED * radius, reach));
+  const sorting = reach > SORTED * radius ? new Sorting(scene, sphere) : null;
   const refine = (/** @type {GaussianSplat} */ splats) => {
-    splats.boundingSphere = sphere;
+    const { onBeforeRender: own } = splats;
+    splats.boundingSphere = whole; // by which three.js culls, and chooses the depths that it sorts
+    splats.onBeforeRender = (renderer, shown, camera) => {
+      splats.boundingSphere = sorting?.sphereFor(splats, camera) ?? sphere;
+      own(renderer, shown, camera);
+      splats.boundingSphere = whole;
+    };
     drawing?.start(splats);
   };
   const [x, y, z] = scene.signs;
   geometry.userData = { csplat: { ...facts, fromFile: new Matrix4().makeScale(x, y, z), upright, refine } };
   geometry.addEventListener('dispose', () => scene.abort());
   return geometry;
+}
+
+/** Chooses the depths in which splats are sorted, of a scene with far parts: where most of what the camera sees is. */
+class Sorting {
+  /**
+   * @param {SplatScene} scene
+   * @param {Sphere} usual the sphere around most splats
+   */
+  constructor({ header: { tiles }, signs }, usual) {
+    this.usual = usual;
+    this.tiles = tiles.map(({ min, max, splatCount: count }) => ({
+      centre: signs.map((sign, k) => (sign * (min[k] + max[k])) / 2),
+      half: signs.map((_, k) => (max[k] - min[k]) / 2),
+      count,
+    }));
+    this.modelView = new Matrix4();
+    this.sphere = new Sphere();
+    this.last = [0, 0];
+  }
+
+  /**
+   * @param {GaussianSplat} splats
+   * @param {import('three').PerspectiveCamera} camera
+   * @returns {Sphere} in the coordinates of the splats
+   */
+  sphereFor(splats, camera) {
+    if (this.tiles.length > TILES_MAX) return this.usual;
+    const { elements: e } = this.modelView.multiplyMatrices(camera.matrixWorldInverse, splats.matrixWorld);
+    const scale = splats.matrixWorld.getMaxScaleOnAxis();
+    const least = camera.near;
+    const seen = [];
+    for (const { centre, half, count } of this.tiles) {
+      const depth = -(e[2] * centre[0] + e[6] * centre[1] + e[10] * centre[2] + e[14]);
+      const reach = Math.abs(e[2]) * half[0] + Math.abs(e[6]) * half[1] + Math.abs(e[10]) * half[2];
+      const near = Math.max(least, depth - reach);
+      const far = depth + reach;
+      if (far > least) seen.push({ near, far, middle: (near + far) / 2, weight: count / (near + far) ** 2 });
+    }
+    const total = seen.reduce((sum, { weight }) => sum + weight, 0);
+    const { center, radius } = this.usual;
+    const depth = -(e[2] * center.x + e[6] * center.y + e[10] * center.z + e[14]);
+    const usual = seen.filter(({ middle }) => Math.abs(middle - depth) <= scale * radius);
+    const length = 2 * scale * radius;
+    let best = heaviest(seen, length / FINER);
+    if (best.weight < MOST * total) {
+      const isUsual = usual.reduce((sum, { weight }) => sum + weight, 0) >= total / 2;
+      best = isUsual ? { near: depth - length / 2, far: depth + length / 2, weight: 0 } : heaviest(seen, length);
+    }
+    const [near, far] = this.last;
+    const change = Math.abs(best.near - near) + Math.abs(best.far - far);
+    if (change > RESORTED * (best.far - best.near)) {
+      splats._sortInitialized = false;
+      this.last = [best.near, best.far];
+    }
+    this.sphere.center.set(0, 0, -(best.near + best.far) / 2).applyMatrix4(this.modelView.invert());
+    this.sphere.radius = (best.far - best.near) / 2 / scale;
+    return this.sphere;
+  }
+}
+
+/**
+ * Return the depths, at most `length`, between which most of the weight of tiles is.
+ *
+ * @param {{near: number, far: number, middle: number, weight: number}[]} seen
+ * @param {number} length
+ */
+function heaviest(seen, length) {
+  let best = { near: 0, far: 0, weight: 0 };
+  for (const { near } of seen) {
+    const within = seen.filter(({ middle }) => middle >= near && middle <= near + length);
+    const weight = within.reduce((sum, one) => sum + one.weight, 0);
+    const far = Math.min(near + length, Math.max(...within.map((one) => one.far)));
+    if (weight > best.weight) best = { near, far, weight };
+  }
+  return best;
 }
 
 /** What a GaussianSplat draws of a pool. It reads its geometry only on construction, so its buffers are changed. */

@@ -12,6 +12,7 @@ declare module 'three' {
   }
   export class Sphere {
     constructor(center?: Vector3, radius?: number);
+    center: Vector3;
     radius: number;
   }
   export class BufferGeometry {
@@ -28,6 +29,7 @@ declare module 'three' {
     elements: number[];
     clone(): Matrix4;
     invert(): this;
+    getMaxScaleOnAxis(): number;
     set(...rows: number[]): this;
     makeScale(x: number, y: number, z: number): this;
     multiplyMatrices(a: Matrix4, b: Matrix4): this;
@@ -38,7 +40,12 @@ declare module 'three' {
   }
   export class Vector3 {
     constructor(...coordinates: number[]);
+    x: number;
+    y: number;
+    z: number;
     applyMatrix4(matrix: Matrix4): this;
+    distanceTo(other: Vector3): number;
+    set(x: number, y: number, z: number): this;
   }
   export class PerspectiveCamera {
     near: number;
