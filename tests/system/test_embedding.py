@@ -507,6 +507,17 @@ def image_of(page, blob):
     return read_pixels(page, "image.data", width, height), kind
 
 
+def test_an_element_wider_than_the_gpu_can_draw_has_fewer_pixels(tab, blog):
+    scene = '<csplat-view src="/scene.csplat" backend="webgl2" style="width: 40000px; height: 2000px"></csplat-view>'
+    page = blog(scene, policy="")
+    page.wait_for_function("document.querySelector('csplat-view').shadowRoot.querySelector('canvas').width > 4000")
+    image, _ = image_of(page, "document.querySelector('csplat-view').toBlob()")
+    height, width, _ = image.shape
+    assert width in (4096, 8192, 16384, 32768)
+    assert round(width / 20) == height
+    assert (image[..., :3].max(axis=2) > 60).mean() > 0.001
+
+
 def test_a_page_shows_through_a_transparent_scene_and_images_of_it(tab, blog):
     scene = '<csplat-view src="/scene.csplat" background="transparent" backend="{}"></csplat-view>'
     for backend in ("webgl2", "webgpu-tiles", "webgpu-quads"):

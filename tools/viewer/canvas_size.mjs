@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// The size of the drawing buffer: CSS size times pixel ratio, reduced while the camera moves on a slow machine.
+// The size of the drawing buffer: CSS size times pixel ratio, at most what the GPU can draw, and reduced while the camera moves on
+// a slow machine.
 
-/** @typedef {{setSize: (width: number, height: number) => void}} Sized */
+/** @typedef {{setSize: (width: number, height: number) => void, sideMax: number}} Sized */
 
 const PIXEL_RATIO = 2; // maximum pixels of the drawing buffer per CSS pixel; more makes no visible difference for splats
 const SLOW_MS = 45; // frame time while moving above which resolution is reduced
@@ -49,11 +50,11 @@ export class CanvasSize {
 
   /** @param {number} quality share of the full resolution */
   #sizeAt(quality) {
-    const { canvas, fixed } = this;
-    const ratio = Math.min(devicePixelRatio || 1, PIXEL_RATIO) * quality;
-    const width = fixed?.width ?? Math.max(1, Math.round(canvas.clientWidth * ratio));
-    const height = fixed?.height ?? Math.max(1, Math.round(canvas.clientHeight * ratio));
-    return { width, height };
+    const { canvas, fixed, engine } = this;
+    const [wide, high] = fixed ? [fixed.width, fixed.height] : [canvas.clientWidth, canvas.clientHeight];
+    const wanted = fixed ? 1 : Math.min(devicePixelRatio || 1, PIXEL_RATIO) * quality;
+    const ratio = Math.min(wanted, (engine?.sideMax ?? Infinity) / Math.max(1, wide, high));
+    return { width: Math.max(1, Math.round(wide * ratio)), height: Math.max(1, Math.round(high * ratio)) };
   }
 
   /** Set the drawing buffer to its current target size. */

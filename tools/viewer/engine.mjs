@@ -241,12 +241,17 @@ class SplatEngine {
   }
 
   /**
-   * @param {number} width
-   * @param {number} height
+   * @param {number} width at most `sideMax`
+   * @param {number} height at most `sideMax`
    */
   setSize(width, height) {
     this.size = { width, height };
     this.updateView();
+  }
+
+  /** Maximum width and height of a picture, pixels. */
+  get sideMax() {
+    return this.renderer.capabilities.sideMax;
   }
 
   updateView() {
@@ -345,7 +350,7 @@ class SplatEngine {
    */
   async picture({ width, height, camera, type = 'image/png', quality }) {
     const refuse = (/** @type {string} */ message, code = E_INPUT) => new EngineError({ code, message });
-    const { opening, renderer } = this;
+    const { opening } = this;
     const own = camera ?? this.camera;
     if (this.frames.isClosed) throw refuse('the engine was closed before the picture was made', E_SUPERSEDED);
     if (opening === null || own === null) throw refuse('no picture can be made: no scene is open, or no camera is set');
@@ -354,7 +359,7 @@ class SplatEngine {
     if (![size.width, size.height].every((side) => Number.isInteger(side) && side > 0)) {
       throw refuse(`the size of the picture is ${shown}, expected whole numbers above 0`);
     }
-    const { sideMax } = renderer.capabilities;
+    const { sideMax } = this;
     if (Math.max(size.width, size.height) > sideMax || size.width * size.height > PIXELS_MAX) {
       throw new RangeError(`${shown}, at most ${sideMax} on each side and ${PIXELS_MAX} altogether are possible`);
     }

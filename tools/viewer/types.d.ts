@@ -182,6 +182,8 @@ export interface Engine {
   setCamera(camera: Camera): void;
   /** Set the size of the drawing buffer, pixels. */
   setSize(width: number, height: number): void;
+  /** Maximum width and height of the drawing buffer, pixels. */
+  readonly sideMax: number;
   setBackground(background: Background): void;
   /** Show SH bands up to this degree. */
   setShDegree(degree: number): void;
