@@ -507,7 +507,7 @@ def image_of(page, blob):
     return read_pixels(page, "image.data", width, height), kind
 
 
-def test_an_element_wider_than_the_gpu_can_draw_has_fewer_pixels(tab, blog):
+def test_an_element_wider_than_the_gpu_can_draw_has_fewer_pixels(blog):
     scene = '<csplat-view src="/scene.csplat" backend="webgl2" style="width: 40000px; height: 2000px"></csplat-view>'
     page = blog(scene, policy="")
     page.wait_for_function("document.querySelector('csplat-view').shadowRoot.querySelector('canvas').width > 4000")

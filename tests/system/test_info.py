@@ -27,6 +27,13 @@ def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
     assert "exists: --force replaces it" in refused(name, *words, *report)
 
 
+def test_values_that_this_version_does_not_know_are_printed():
+    path = VECTORS / "valid" / "additions.csplat"
+    assert "colour space 128, projection 129 (unknown), antialiasing 200 (unknown)" in printed("info", path)
+    report = json.loads(printed("info", path, "--json"))
+    assert ["129", "200", "128"] == [report[name] for name in ("projection", "antialiasing", "colour_space")]
+
+
 def test_a_full_standard_output_is_one_line_and_a_closed_pipe_no_traceback(csplat_file, monkeypatch, capsys):
     def written_to(output, *words):
         monkeypatch.setattr(sys, "stdout", output)

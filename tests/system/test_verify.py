@@ -12,6 +12,7 @@ from command_line import invoke, printed, refused
 
 from csplat import _spec, write_ply
 from csplat.ply import read_ply
+from csplat_conformance.manifest import VECTORS
 
 pytestmark = pytest.mark.usefixtures("no_first_view")
 
@@ -52,6 +53,12 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     assert first.startswith(f"error: {csplat_file}: 4 violations of HDR-3, IDX-1, RES-1;")
     assert "error: the declared errors were not checked" == second
     assert "" == invoke("verify", csplat_file, "--quiet").stdout
+
+
+def test_a_file_of_a_later_version_calls_for_an_update():
+    result = invoke("verify", VECTORS / "invalid" / "version_1_1.csplat")
+    assert 1 == result.exit_code
+    assert "1 violation of HDR-2; update csplat, or have it written" in result.stderr
 
 
 @pytest.mark.slow

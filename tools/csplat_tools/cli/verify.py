@@ -65,7 +65,11 @@ def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> No
         clauses, codes = (
             ", ".join(sorted({getattr(violation, name) for violation in violations})) for name in ("clause", "code")
         )
-        remedy = "--limit-splats allows fewer splats" if codes == "E_LIMIT" else "copy or make it again"
+        remedies = {
+            "E_LIMIT": "--limit-splats allows fewer splats",
+            "E_VERSION": "update csplat, or have it written as a version that this one reads",
+        }
+        remedy = remedies.get(codes, "copy or make it again")
         note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; {remedy} ({codes})")
     if unverified:
         note("error: the declared errors were not checked")

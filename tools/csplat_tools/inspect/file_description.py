@@ -223,8 +223,8 @@ class FileDescription:
             "origin": list(header.origin),
             "box": self.box(),
             "kernel": header.kernel,
-            "projection": _spec.PROJECTION_NAMES.get(header.projection, header.projection),
-            "antialiasing": _spec.ANTIALIASING_NAMES.get(header.antialiasing, header.antialiasing),
+            "projection": _spec.PROJECTION_NAMES.get(header.projection, str(header.projection)),
+            "antialiasing": _spec.ANTIALIASING_NAMES.get(header.antialiasing, str(header.antialiasing)),
             "colour_space": metadata.colour_space,
             "antialiased": header.antialiased,
             "flat": header.flat,
@@ -419,6 +419,12 @@ def describe_placement(scene: SceneHeader | Scene, count: int, metadata: SceneMe
     """
     flags = [name for name in ("antialiased", "flat") if getattr(metadata, name)]
     flags += [f"colour space {metadata.colour_space}"] * (metadata.colour_space != SRGB)
+    if isinstance(scene, SceneHeader):
+        flags += [
+            f"{field} {value} (unknown)"
+            for field, value in (("projection", scene.projection), ("antialiasing", scene.antialiasing))
+            if value >= _spec.ANCILLARY_ID_MIN
+        ]
     up, unit = metadata.up, metadata.unit_metres
     estimated = " (estimated)" if UP in metadata.estimated else ""
     return {
