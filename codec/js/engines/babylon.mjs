@@ -224,7 +224,7 @@ class Drawing {
     this.upload();
     const observer = scene.onBeforeRenderObservable.add(() => this.look(mesh));
     mesh.onDisposeObservable.addOnce(() => observer.remove());
-    mesh.getBoundingInfo().reConstruct(...opened.corners(Vector3), mesh.getWorldMatrix());
+    mesh.getBoundingInfo().reConstruct(...opened.corners(Vector3, undefined, 3), mesh.getWorldMatrix());
   }
 
   /** @param {GaussianSplattingMesh} mesh */

@@ -234,18 +234,20 @@ export class SplatScene {
   }
 
   /**
-   * Return two corners of the box of all splats, three standard deviations of the largest around their centres, not turned.
+   * Return two corners of the box of all centres, or of all splats, not turned.
    *
    * @template T
    * @param {new (x: number, y: number, z: number) => T} Vector of the engine
    * @param {Header} [header] with the tiles; all levels if it is missing
+   * @param {number} [sigmas] standard deviations of the largest splat of a tile around its centres
    * @returns {[T, T]}
    */
-  corners(Vector, header) {
+  corners(Vector, header, sigmas = 0) {
     const all = header?.tiles ?? allTiles(this.file);
     const [low, high] = /** @type {const} */ (['min', 'max']).map((side) =>
       [0, 1, 2].map((axis) => {
-        const beyond = (/** @type {number} */ maxScale) => (side === 'min' ? -3 : 3) * Math.exp(Math.min(maxScale, 80));
+        const reach = side === 'min' ? -sigmas : sigmas;
+        const beyond = (/** @type {number} */ maxScale) => reach * Math.exp(Math.min(maxScale, 80));
         return Math[side](...all.map((tile) => tile[side][axis] + beyond(tile.maxScale)));
       }),
     );

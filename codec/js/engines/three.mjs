@@ -151,7 +151,7 @@ async function geometryOf(scene) {
   if (!antialiased)
     onceSaid(NAME, 'three.js draws all scenes as antialiased; small splats of this scene appear too faint');
   bands.addTo(geometry);
-  const box = new Box3(...scene.corners(Vector3));
+  const box = new Box3(...scene.corners(Vector3, undefined, 3));
   const whole = box.getBoundingSphere(new Sphere());
   if (scene.levels) [geometry.boundingBox, geometry.boundingSphere] = [box, whole];
   else {
