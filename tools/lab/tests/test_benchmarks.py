@@ -474,11 +474,11 @@ sizes = {{ lego800 = [24, 16] }}
 published = "photographs"
 [[cases]]
 name = "few"
-train = {{ max_splats = 40, sh_degree = 0, iterations = 30 }}
+train = {{ max_splats = 40, sh_degree = 0, iterations = 400 }}
 [[cases]]
 name = "more"
 after = "few"
-train = {{ max_splats = 60, sh_degree = 0, iterations = 60 }}
+train = {{ max_splats = 60, sh_degree = 0, iterations = 400 }}
 [[cases]]
 name = "kept"
 of = "more"
@@ -550,21 +550,21 @@ def test_scenes_of_the_papers_come_first_and_others_are_named(disk, capsys):
 def test_a_data_set_is_trained_scored_and_encoded_once(tmp_path):
     write_blender(tmp_path / "data" / "lego")
     text = 'title = "t"\nsubject = "captures"\nscenes = ["*"]\n[options]\npublished = "captures"\n'
-    text += 'train = { iterations = 20, max_splats = 60, sh_degree = 1 }\n[[cases]]\nname = "PLY"\n'
+    text += 'train = { iterations = 400, max_splats = 60, sh_degree = 1 }\n[[cases]]\nname = "PLY"\n'
     text += '[[cases]]\nname = "fast"\npreset = "fast"\n[[cases]]\nname = "tuned"\nmegabytes = 0.004\n'
     (tmp_path / "s.toml").write_text(text)
     status, found = run(tmp_path / "s.toml", tmp_path, "--data", tmp_path / "data")
     assert 0 == status
     ply, fast, tuned, published, *_ = found["rows"]
-    assert ("synthetic-lego", "PLY", 20) == (ply["scene"], ply["case"], ply["steps"])
-    assert "20 steps, the papers' 30000" in ply["remarks"]
+    assert ("synthetic-lego", "PLY", 400) == (ply["scene"], ply["case"], ply["steps"])
+    assert "400 steps, the papers' 30000" in ply["remarks"]
     trained = tmp_path / "work" / "captures" / "synthetic-lego.ply"
     assert fast["size_bytes"] < ply["size_bytes"] == trained.stat().st_size
     assert tuned["size_bytes"] <= 4000
     assert all(abs(row["psnr_mean"] - ply["psnr_mean"]) < 3.0 for row in (fast, tuned))
     assert {"pruning", "choosing", "encoding", "tuning"} <= tuned["seconds"].keys()
     assert 35.78 == published["psnr_mean"]
-    (tmp_path / "s.toml").write_text(text.replace("= 20", "= 25"))
+    (tmp_path / "s.toml").write_text(text.replace("= 400", "= 405"))
     suite = load_suite(str(tmp_path / "s.toml"), list(SUBJECTS))
     setup = replace(setup_of(tmp_path / "work"), data=tmp_path / "data", options=suite.options)
     with (

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import csplat
-from csplat.errors import InputError
+from csplat.errors import FormatError, InputError, LimitError, UnsupportedError
 from csplat.formats import formats, read, write
 from csplat.model import QUAT_LENGTH_TOLERANCE, SplatModel, normalise_quats
 from csplat.ply import lint_ply, read_ply, write_ply
@@ -172,7 +172,7 @@ class Seed:
 
 
 class FormatTarget(FileTarget):
-    """The readers of other formats, which must return a valid model or raise InputError."""
+    """The readers of other formats, which must return a valid model or raise `InputError`, or that of a .csplat inside."""
 
     name = "formats"
     suffix = ".case"
@@ -207,7 +207,7 @@ class FormatTarget(FileTarget):
             warnings.simplefilter("error")
             try:
                 model = read(path, keep_extra=zlib.crc32(data) % 4 == 0)
-            except InputError:
+            except (InputError, FormatError, UnsupportedError, LimitError):
                 return "refused", ""
             wrong = unsound(model)
         return ("finding", wrong) if wrong else ("read", "")
