@@ -172,7 +172,7 @@ class Seed:
 
 
 class FormatTarget(FileTarget):
-    """The readers of other formats, which return a valid model or raise `InputError`, or the error of a .csplat inside."""
+    """The readers of other formats: a valid model, an `InputError`, or the error of a .csplat inside."""
 
     name = "formats"
     suffix = ".case"
