@@ -210,12 +210,16 @@ CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CO
 META_KEY_TITLE: Final = "title"
 META_KEY_LICENCE: Final = "licence"
 META_KEY_SOURCE: Final = "source"
+META_KEY_AUTHOR: Final = "author"
+META_KEY_CREATED: Final = "created"
+META_KEY_SOFTWARE: Final = "software"
+META_KEY_CRS: Final = "crs"
 META_KEY_COMMENTS: Final = "comments"
 META_KEY_TRAINING: Final = "training"
 META_KEY_UP: Final = "up"
 META_KEY_VIEW: Final = "view"
 META_KEY_ESTIMATED: Final = "estimated"
-META_KEY_NAMES: Final[dict[str, str]] = {"title": "title", "licence": "licence", "source": "source", "comments": "comments", "training": "training", "up": "up", "view": "view", "estimated": "estimated"}
+META_KEY_NAMES: Final[dict[str, str]] = {"title": "title", "licence": "licence", "source": "source", "author": "author", "created": "created", "software": "software", "crs": "crs", "comments": "comments", "training": "training", "up": "up", "view": "view", "estimated": "estimated"}
 
 # Semantics of extra columns
 SEMANTIC_LABEL: Final = "label"

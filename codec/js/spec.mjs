@@ -202,12 +202,16 @@ export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 
 export const META_KEY_TITLE = 'title';
 export const META_KEY_LICENCE = 'licence';
 export const META_KEY_SOURCE = 'source';
+export const META_KEY_AUTHOR = 'author';
+export const META_KEY_CREATED = 'created';
+export const META_KEY_SOFTWARE = 'software';
+export const META_KEY_CRS = 'crs';
 export const META_KEY_COMMENTS = 'comments';
 export const META_KEY_TRAINING = 'training';
 export const META_KEY_UP = 'up';
 export const META_KEY_VIEW = 'view';
 export const META_KEY_ESTIMATED = 'estimated';
-export const META_KEY_NAMES = Object.freeze({ 'title': 'title', 'licence': 'licence', 'source': 'source', 'comments': 'comments', 'training': 'training', 'up': 'up', 'view': 'view', 'estimated': 'estimated' });
+export const META_KEY_NAMES = Object.freeze({ 'title': 'title', 'licence': 'licence', 'source': 'source', 'author': 'author', 'created': 'created', 'software': 'software', 'crs': 'crs', 'comments': 'comments', 'training': 'training', 'up': 'up', 'view': 'view', 'estimated': 'estimated' });
 
 // Semantics of extra columns
 export const SEMANTIC_LABEL = 'label';
