@@ -983,7 +983,7 @@ static double largest_scale(const encoder *e, uint32_t row)
     return larger(larger(scales[0], scales[1]), scales[2]);
 }
 
-/* Return the median of largest standard deviations, of their logarithms, which are sorted. */
+/* Sort the logarithms of largest standard deviations, and return their median as a standard deviation. */
 static int median_size(encoder *e, double *sizes, uint32_t count, double *size)
 {
     double median;
@@ -993,7 +993,7 @@ static int median_size(encoder *e, double *sizes, uint32_t count, double *size)
     return 1;
 }
 
-/* Find the parts of a scene between which there is much more space than within them (coding_parameters.find_parts). */
+/* Find the parts of a scene between which there is much more space than within them (scene_parts.find_parts). */
 static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigned *part_count)
 {
     view few = thin_out(sample, PART_SAMPLE);
@@ -1061,15 +1061,13 @@ static int find_parts(encoder *e, const view *sample, scene_part *parts, unsigne
     return 1;
 }
 
-/* Collect the rows of a view that are in a part, in their order. */
-static uint32_t rows_of_part(const encoder *e, const view *v, const statistics *s, unsigned part, uint32_t *rows)
+/* Collect the rows of a view that are in a part, in their order; `parts` has the part of each row of the scene. */
+static uint32_t rows_of_part(const view *v, const uint8_t *parts, unsigned part, uint32_t *rows)
 {
     uint32_t count = 0;
-    for (uint32_t i = 0; i < v->count; i++) {
-        uint32_t row = row_of(v, i);
-        if (part_of(s->parts, s->part_count, e->in->means + 3 * (size_t)row) == part)
-            rows[count++] = row;
-    }
+    for (uint32_t i = 0; i < v->count; i++)
+        if (parts[row_of(v, i)] == part)
+            rows[count++] = row_of(v, i);
     return count;
 }
 
@@ -1079,11 +1077,17 @@ static int measure_scene(encoder *e, const view *v, double contrast, statistics 
     view sample = thin_out(v, STATISTICS_SAMPLE);
     double centre[3], reaches[PARTS_MAX + 1], sums[2], found = 0.0, *sizes;
     uint32_t *rows;
+    uint8_t *parts;
     TRY(find_parts(e, &sample, s->parts, &s->part_count));
     TRY(rows = get(e, v->count, sizeof *rows));
+    TRY(parts = get(e, e->in->count, sizeof *parts));
+    for (uint32_t i = 0; i < v->count; i++) {
+        uint32_t row = row_of(v, i);
+        parts[row] = (uint8_t)part_of(s->parts, s->part_count, e->in->means + 3 * (size_t)row);
+    }
     s->reach = s->size = 0.0;
     for (unsigned k = 0; k <= s->part_count; k++) {
-        view part = {rows, rows_of_part(e, &sample, s, k, rows), 1};
+        view part = {rows, rows_of_part(&sample, parts, k, rows), 1};
         double size;
         reaches[k] = 0.0;
         if (!part.count || (s->part_count && k == s->part_count && part.count < part_least(sample.count)))
@@ -1099,7 +1103,7 @@ static int measure_scene(encoder *e, const view *v, double contrast, statistics 
         s->size = larger(s->size, reaches[k] > 0.0 ? size / reaches[k] : 1.0);
         if (contrast >= 0.0)
             continue;
-        part.count = rows_of_part(e, v, s, k, rows);
+        part.count = rows_of_part(v, parts, k, rows);
         TRY(find_reach(e, &part, centre, &size));
         TRY(sum_contrast(e, &part, centre, size, &sums[0], &sums[1]));
         found = larger(found, contrast_of(sums[0], sums[1]));
@@ -1110,6 +1114,7 @@ static int measure_scene(encoder *e, const view *v, double contrast, statistics 
         s->parts[k].octaves = octaves > 0 ? -octaves : 0;
     }
     contrast = contrast < 0.0 ? found : contrast;
+    drop(e, parts);
     drop(e, rows);
     s->contrast = clip(contrast, 0.02, 1.0);
     s->size = clip(s->size, 1e-4, 1.0);

@@ -22,10 +22,10 @@ _SAMPLE = 1 << 11  # splats on which parts are found
 _CENTRES = 64  # splats of the sample that may be the centre of a part
 _LEAST = 20  # splats of the sample; fewer are outliers
 _LEAST_SHARE = 0.01  # the same as a fraction of a large sample
-_PARTS_MAX = 32
+_PARTS_MAX = 32  # further parts share the step and the views of the rest
 _GAP = 3.0  # outer by inner radius of the empty shell around a part; in twenty scenes of one piece it is at most 2.9
-_GAP_SHARE = 0.01  # fraction of the sample that the shell may contain,
-_GAP_PART_SHARE = 10  # and at most one splat for every ten of the part, so that it does not cut off the part's border
+_GAP_SHARE = 0.01  # largest fraction of the sample in that shell
+_GAP_PART_SHARE = 10  # splats of the part for each splat in the shell, so that a part keeps its sparse border
 _LOG_SIZE_MAX = 80  # log scale to which the median size is clipped, so that its square stays within float64
 _BLOCK = 1 << 16  # splats per block of temporaries
 

@@ -385,7 +385,7 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float, stati
         return Lattice(_clamp_step(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
     by_quality = by_quality or extent / (1 << _BITS_MAX)
     step = _clamp_step(_source_step(model.means, by_quality), reach)
-    if step != by_quality:  # of a grid that has all means, or the finest
+    if step != by_quality:  # a grid holds every mean, or the step is at its limit: parts need no other
         return Lattice(step, _BITS_MAX)
     return Lattice(step, _BITS_MAX, parts=statistics.parts, octaves=statistics.octaves)
 

@@ -37,7 +37,7 @@ _IMAGES = 12  # images to compare, at most
 _SIDE = 128  # pixels; largest width and height of the images to compare
 _MARGIN_DB = 2.0  # least advantage of a scene over a single colour
 _FLAT = 1e-4  # mean squared error of a single colour below which images show nothing to compare
-_ROTATION_TOLERANCE = 1e-3  # of the products of rows and columns of a rotation
+_ROTATION_TOLERANCE = 1e-3  # largest deviation of R Rᵀ from the identity, for numbers that a file rounds
 
 
 @dataclass(frozen=True)
